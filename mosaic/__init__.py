@@ -1,0 +1,1 @@
+"""Images to homographies to panorama: direct registration and compositing for rotating cameras."""

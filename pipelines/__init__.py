@@ -1,0 +1,1 @@
+"""The main job: clip in; camera log, homographies, panorama and report out."""
