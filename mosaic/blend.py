@@ -1,0 +1,370 @@
+"""From overlapping views of the same surface to one value a pixel: sampling, gains, robust value.
+
+The kernels are numba: they release the GIL, so that two threads work on two tiles. It does not choose which frames
+to use (views.py) and holds no picture (framestore.py).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+# --- sampling ----------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _catmull_rom(t: float) -> tuple[float, float, float, float]:
+    """Weights of the four neighbours for a position t in 0..1 between the middle two."""
+    t2 = t * t
+    t3 = t2 * t
+    return (
+        0.5 * (-t + 2 * t2 - t3),
+        0.5 * (2 - 5 * t2 + 3 * t3),
+        0.5 * (t + 4 * t2 - 3 * t3),
+        0.5 * (t3 - t2),
+    )
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def sample_view(image, trust, has_trust, grid, step, gain, margin, feather, cubic, out, out_trust, out_weight):  # type: ignore[no-untyped-def]
+    """Sample one frame over one tile.
+
+    image (H, W, 3) uint8; trust (H, W) uint8, read when has_trust. grid (rows, columns, 3) float32: frame x, frame y
+    and weight 0..1 at every `step`-th tile pixel, linear in between; a cell with a NaN corner is not seen. gain (3,)
+    multiplies the channels. A sample nearer than `margin` px to the frame's border is not seen; from there the
+    weight rises over `feather` px, so that no frame edge shows.
+    Out, all uint8: out (3, h, w); out_trust (h, w), 0 = not seen; out_weight (h, w), at least 1 where seen.
+    Catmull-Rom (cubic) or linear; float weights (cv2.remap rounds positions to 1/32 px).
+    """
+    height, width = image.shape[0], image.shape[1]
+    rows, columns = out_trust.shape
+    x_last, y_last = width - 1 - margin, height - 1 - margin
+    gain_r, gain_g, gain_b = gain[0], gain[1], gain[2]
+    for row in range(rows):
+        i = row // step
+        v = np.float32((row - i * step) / step)
+        for j in range((columns + step - 1) // step):
+            left = j * step
+            right = min(left + step, columns)
+            x0 = grid[i, j, 0] * (1 - v) + grid[i + 1, j, 0] * v
+            x1 = grid[i, j + 1, 0] * (1 - v) + grid[i + 1, j + 1, 0] * v
+            y0 = grid[i, j, 1] * (1 - v) + grid[i + 1, j, 1] * v
+            y1 = grid[i, j + 1, 1] * (1 - v) + grid[i + 1, j + 1, 1] * v
+            w0 = grid[i, j, 2] * (1 - v) + grid[i + 1, j, 2] * v
+            w1 = grid[i, j + 1, 2] * (1 - v) + grid[i + 1, j + 1, 2] * v
+            # -1e9 marks a corner that the frame does not see: any mix with it falls far outside.
+            dx, dy, dw = (x1 - x0) / step, (y1 - y0) / step, (w1 - w0) / step
+            for column in range(left, right):
+                u = column - left
+                x = x0 + dx * u
+                y = y0 + dy * u
+                w = w0 + dw * u
+                if not (x >= margin and y >= margin and x <= x_last and y <= y_last and w > 0):
+                    out_trust[row, column] = 0
+                    out_weight[row, column] = 0
+                    continue
+                xi, yi = int(x), int(y)
+                if has_trust:
+                    sure = trust[int(y + 0.5), int(x + 0.5)]
+                else:
+                    sure = np.uint8(255)
+                if sure == 0:
+                    out_trust[row, column] = 0
+                    out_weight[row, column] = 0
+                    continue
+                s, t = x - xi, y - yi
+                if cubic:
+                    a0, a1, a2, a3 = _catmull_rom(s)
+                    b0, b1, b2, b3 = _catmull_rom(t)
+                    r = g = b = np.float32(0)
+                    for m in range(4):
+                        k = b0 if m == 0 else (b1 if m == 1 else (b2 if m == 2 else b3))
+                        line = image[yi - 1 + m]
+                        r += k * (a0 * line[xi - 1, 0] + a1 * line[xi, 0] + a2 * line[xi + 1, 0] + a3 * line[xi + 2, 0])
+                        g += k * (a0 * line[xi - 1, 1] + a1 * line[xi, 1] + a2 * line[xi + 1, 1] + a3 * line[xi + 2, 1])
+                        b += k * (a0 * line[xi - 1, 2] + a1 * line[xi, 2] + a2 * line[xi + 1, 2] + a3 * line[xi + 2, 2])
+                else:
+                    k00, k01, k10, k11 = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
+                    p, q = image[yi], image[yi + 1]
+                    r = k00 * p[xi, 0] + k01 * p[xi + 1, 0] + k10 * q[xi, 0] + k11 * q[xi + 1, 0]
+                    g = k00 * p[xi, 1] + k01 * p[xi + 1, 1] + k10 * q[xi, 1] + k11 * q[xi + 1, 1]
+                    b = k00 * p[xi, 2] + k01 * p[xi + 1, 2] + k10 * q[xi, 2] + k11 * q[xi + 1, 2]
+                out[0, row, column] = np.uint8(min(max(r * gain_r + 0.5, 0.0), 255.0))
+                out[1, row, column] = np.uint8(min(max(g * gain_g + 0.5, 0.0), 255.0))
+                out[2, row, column] = np.uint8(min(max(b * gain_b + 0.5, 0.0), 255.0))
+                edge = min(min(x - margin, x_last - x), min(y - margin, y_last - y)) + 1
+                w *= min(edge / feather, 1.0) * sure
+                out_trust[row, column] = sure
+                out_weight[row, column] = np.uint8(min(max(w + 0.5, 1.0), 255.0))
+
+
+# --- photometry --------------------------------------------------------------------------------------------------
+
+
+def solve_log_gains(
+    log_samples: NDArray[np.floating],
+    weight: NDArray[np.floating],
+    *,
+    prior_std: float = 0.3,
+    noise_std: float = 0.05,
+    n_steps: int = 6,
+) -> NDArray[np.float64]:
+    """Log gain to ADD to each frame so that all agree, from log intensities of the same points in many frames.
+
+    log_samples (n, p): frame i at point j; weight (n, p), 0 where not seen. Minimises sum w rho(y_ij + g_i - b_j) +
+    (noise_std / prior_std)^2 sum g_i^2 over frame gains g and point colours b by iteratively reweighted least squares;
+    the p colours are eliminated exactly, what is solved is n x n. Huber first, then Tukey: players must not pull.
+    Returns (n,), median 0. A frame that shares no point with another gets 0 (before the median is taken off).
+    """
+    y = np.asarray(log_samples, dtype=np.float32)
+    base = np.asarray(weight, dtype=np.float32)
+    if y.shape != base.shape or y.ndim != 2:
+        raise ValueError(f"samples {y.shape} and weights {base.shape} must be equal and two-dimensional")
+    n = len(y)
+    gain = np.zeros(n)
+    shared = (base > 0).sum(axis=0) >= 2  # a point seen once says nothing
+    y, base = y[:, shared], base[:, shared]
+    if not shared.any():
+        return gain
+    ridge = (noise_std / prior_std) ** 2
+    robust = base
+    for step in range(n_steps):
+        total = robust.sum(axis=0)
+        share = robust / np.maximum(total, 1e-9)
+        colour = (share * y).sum(axis=0)
+        normal = -(robust @ share.T).astype(np.float64)
+        normal[np.diag_indices(n)] += robust.sum(axis=1, dtype=np.float64) + ridge
+        gain = np.linalg.solve(normal, -(robust * (y - colour)).sum(axis=1, dtype=np.float64))
+        adjusted = y + gain[:, None].astype(np.float32)
+        residual = adjusted - (share * adjusted).sum(axis=0)
+        seen = base > 0
+        scale = max(1.4826 * float(np.median(np.abs(residual[seen]))), 0.005)
+        ratio = np.abs(residual) / scale
+        if step < n_steps // 2:
+            robust = base / np.maximum(ratio / 1.5, 1.0)
+        else:
+            robust = base * np.clip(1 - (ratio / 5.0) ** 2, 0.0, 1.0) ** 2
+    return gain - np.median(gain)
+
+
+# --- robust value ------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=256)
+def median_network(n: int) -> NDArray[np.int32]:
+    """Comparators (m, 2) of Batcher's odd-even merge sort of n values, pruned to those that element n // 2 needs."""
+    pairs: list[tuple[int, int]] = []
+    p = 1
+    while p < n:
+        k = p
+        while k >= 1:
+            for j in range(k % p, n - k, 2 * k):
+                for i in range(min(k, n - j - k)):
+                    if (i + j) // (2 * p) == (i + j + k) // (2 * p):
+                        pairs.append((i + j, i + j + k))
+            k //= 2
+        p *= 2
+    needed, kept = {n // 2}, []
+    for a, b in reversed(pairs):
+        if a in needed or b in needed:
+            needed |= {a, b}
+            kept.append((a, b))
+    network = np.array(kept[::-1], dtype=np.int32).reshape(-1, 2)
+    network.setflags(write=False)
+    return network
+
+
+_BLOCK = 256  # pixels sorted side by side: 48 views x 256 bytes stay in the first-level cache
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _sort(rows, network):  # type: ignore[no-untyped-def]
+    for m in range(len(network)):
+        a, b = rows[network[m, 0]], rows[network[m, 1]]
+        for p in range(len(a)):
+            x, y = a[p], b[p]
+            a[p] = x if x < y else y
+            b[p] = y if x < y else x
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _weighted_median(values, weights, n):  # type: ignore[no-untyped-def]
+    """Sorts both in place; the value at which half of the weight is reached."""
+    total = np.float32(0)
+    for i in range(n):
+        total += weights[i]
+        v, w = values[i], weights[i]
+        j = i - 1
+        while j >= 0 and values[j] > v:
+            values[j + 1], weights[j + 1] = values[j], weights[j]
+            j -= 1
+        values[j + 1], weights[j + 1] = v, w
+    reached = np.float32(0)
+    for i in range(n):
+        reached += weights[i]
+        if 2 * reached >= total:
+            return values[i]
+    return values[n - 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, spread):  # type: ignore[no-untyped-def]
+    """One colour a pixel from n views.
+
+    stack (n, 3, N), trust (n, N), weight (n, N) uint8 as sample_view gives them; network = median_network(n).
+    1. median per channel over the views that see the pixel (a missing one is padded with 0 and 255 in turn);
+    2. distance d of each view to it (mean of channels, green twice), spread = 1.4826 median d;
+    3. where spread > doubt (grey levels), or where a view is only half trusted: a weighted median instead, because
+       then it matters which views saw it best (parallax, a player who stands in many of them);
+    4. weighted mean of the views within 2 min(spread, cap) + floor of the median; the nearest view if none is.
+    One view: taken. Two: the heavier one is the centre. Out: out (N, 3), n_seen (N,), spread (N,), uint8.
+    """
+    n, _, size = stack.shape
+    rows = np.empty((n, _BLOCK), np.uint8)
+    centre = np.empty((3, _BLOCK), np.uint8)
+    apart = np.empty((n, _BLOCK), np.uint8)
+    missing = np.empty(_BLOCK, np.uint8)
+    partial = np.empty(_BLOCK, np.uint8)
+    median = np.empty(_BLOCK, np.uint8)
+    total = np.empty((4, _BLOCK), np.float32)
+    values = np.empty(n, np.uint8)
+    weights = np.empty(n, np.float32)
+    half = n // 2
+    first_pad = np.uint8(n % 2)  # odd n: the first pad goes high, even n: low, so that the rank stays the middle
+    for start in range(0, size, _BLOCK):
+        length = min(_BLOCK, size - start)
+        stop = start + length
+        missing[:] = 0
+        partial[:] = 0
+        for k in range(n):
+            seen = trust[k, start:stop]
+            for p in range(length):
+                missing[p] += np.uint8(1) if seen[p] == 0 else np.uint8(0)
+                partial[p] |= np.uint8(1) if (seen[p] > 0) & (seen[p] < 250) else np.uint8(0)
+        for c in range(4):
+            pads = np.full(_BLOCK, first_pad, np.uint8)
+            for k in range(n):
+                row = rows[k]
+                source = stack[k, c, start:stop] if c < 3 else apart[k, :length]
+                seen = trust[k, start:stop]
+                for p in range(length):
+                    absent = np.uint8(1) if seen[p] == 0 else np.uint8(0)
+                    pad = np.uint8(255) if pads[p] & np.uint8(1) else np.uint8(0)
+                    row[p] = pad if absent else source[p]
+                    pads[p] += absent
+            _sort(rows, network)
+            if c < 3:
+                for p in range(length):
+                    centre[c, p] = rows[half, p]
+            else:
+                for p in range(length):
+                    median[p] = rows[half, p]
+            if c == 2:
+                for k in range(n):
+                    r, g, b = stack[k, 0, start:stop], stack[k, 1, start:stop], stack[k, 2, start:stop]
+                    for p in range(length):
+                        d = (
+                            abs(np.int16(r[p]) - np.int16(centre[0, p]))
+                            + 2 * abs(np.int16(g[p]) - np.int16(centre[1, p]))
+                            + abs(np.int16(b[p]) - np.int16(centre[2, p]))
+                        )
+                        apart[k, p] = np.uint8((d + 2) >> 2)
+        # Where the plain median may not be the right one: few views, disagreement, half-trusted views.
+        for p in range(length):
+            count = n - missing[p]
+            n_seen[start + p] = count
+            sigma = np.float32(1.4826) * median[p]
+            spread[start + p] = np.uint8(min(sigma + np.float32(0.5), np.float32(255)))
+            if count == 0 or not (count <= 2 or partial[p] or sigma > doubt):
+                continue
+            at = start + p
+            if count <= 2:
+                best = -1
+                for k in range(n):
+                    if trust[k, at] > 0 and (best < 0 or weight[k, at] > weight[best, at]):
+                        best = k
+                for c in range(3):
+                    centre[c, p] = stack[best, c, at]
+            else:
+                for c in range(3):
+                    m = 0
+                    for k in range(n):
+                        if trust[k, at] > 0:
+                            values[m] = stack[k, c, at]
+                            weights[m] = weight[k, at]
+                            m += 1
+                    centre[c, p] = _weighted_median(values, weights, m)
+            m = 0
+            for k in range(n):
+                d = (
+                    abs(np.int16(stack[k, 0, at]) - np.int16(centre[0, p]))
+                    + 2 * abs(np.int16(stack[k, 1, at]) - np.int16(centre[1, p]))
+                    + abs(np.int16(stack[k, 2, at]) - np.int16(centre[2, p]))
+                )
+                apart[k, p] = np.uint8((d + 2) >> 2)
+                if trust[k, at] > 0:
+                    values[m] = apart[k, p]
+                    weights[m] = weight[k, at]
+                    m += 1
+            if count > 2:
+                median[p] = _weighted_median(values, weights, m)
+            else:
+                # Two views have no spread of their own: they count as one place when they differ by noise only.
+                median[p] = 0
+        total[:] = 0
+        for k in range(n):
+            r, g, b = stack[k, 0, start:stop], stack[k, 1, start:stop], stack[k, 2, start:stop]
+            seen, share = trust[k, start:stop], weight[k, start:stop]
+            for p in range(length):
+                limit = np.float32(2) * min(np.float32(1.4826) * median[p], cap) + floor
+                near = (seen[p] > 0) & (apart[k, p] <= limit)
+                w = np.float32(share[p]) if near else np.float32(0)
+                total[0, p] += w * r[p]
+                total[1, p] += w * g[p]
+                total[2, p] += w * b[p]
+                total[3, p] += w
+        for p in range(length):
+            at = start + p
+            if total[3, p] > 0:
+                for c in range(3):
+                    out[at, c] = np.uint8(total[c, p] / total[3, p] + np.float32(0.5))
+            elif missing[p] < n:
+                best = -1
+                for k in range(n):
+                    if trust[k, at] > 0 and (best < 0 or apart[k, p] < apart[best, p]):
+                        best = k
+                for c in range(3):
+                    out[at, c] = stack[best, c, at]
+            else:
+                for c in range(3):
+                    out[at, c] = 0
+
+
+def blend_stack(
+    stack: NDArray[np.uint8],
+    trust: NDArray[np.uint8],
+    weight: NDArray[np.uint8],
+    *,
+    floor: float = 3.0,
+    cap: float = 10.0,
+    doubt: float = 5.0,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
+    """robust_value for a tile: stack (n, 3, h, w), trust and weight (n, h, w) uint8 -> image (h, w, 3), n_seen, spread.
+
+    floor, cap, doubt in grey levels, see robust_value. Raises ValueError for no view or more than 255.
+    """
+    n, _, height, width = stack.shape
+    if not 1 <= n <= 255:
+        raise ValueError(f"{n} views of a tile, need 1 to 255")
+    image: NDArray[Any] = np.empty((height * width, 3), np.uint8)
+    n_seen: NDArray[Any] = np.empty(height * width, np.uint8)
+    spread: NDArray[Any] = np.empty(height * width, np.uint8)
+    robust_value(
+        stack.reshape(n, 3, -1), trust.reshape(n, -1), weight.reshape(n, -1), median_network(n),
+        np.float32(floor), np.float32(cap), np.float32(doubt), image, n_seen, spread,
+    )  # fmt: skip
+    return image.reshape(height, width, 3), n_seen.reshape(height, width), spread.reshape(height, width)

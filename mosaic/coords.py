@@ -1,0 +1,108 @@
+"""Pixel conventions of this package: homographies on points, pyramid levels, the four-anchor chart.
+
+(0, 0) is the centre of the top-left pixel; points are (x, y). Only this module converts between levels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mosaic.records import FloatArray
+
+
+def normalise_homography(H: ArrayLike) -> FloatArray:
+    """H (..., 3, 3) scaled to det 1 by the real cube root; NaN where H is singular or not finite."""
+    H = np.asarray(H, np.float64)
+    root = np.cbrt(np.linalg.det(H))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return H / np.where(np.abs(root) > 1e-300, root, np.nan)[..., None, None]
+
+
+def transfer(H_b_a: ArrayLike, points_a: ArrayLike) -> FloatArray:
+    """Points (..., 2) of a mapped into b by H_b_a (3, 3); NaN on or behind the line at infinity."""
+    H = np.asarray(H_b_a, np.float64)
+    p = np.asarray(points_a, np.float64)
+    q = p @ H[:, :2].T + H[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(q[..., 2:] > 1e-12, q[..., :2] / q[..., 2:], np.nan)
+
+
+def level_scale(size_px: tuple[int, int], level_size_px: tuple[int, int]) -> tuple[float, float]:
+    """(sx, sy) with x_full = sx x_level + (sx - 1) / 2: what area averaging does, per axis and after rounding."""
+    return size_px[0] / level_size_px[0], size_px[1] / level_size_px[1]
+
+
+def to_full(points_level: ArrayLike, scale: tuple[float, float]) -> FloatArray:
+    """Level pixels (..., 2) to full-size pixels."""
+    s = np.asarray(scale, np.float64)
+    return np.asarray(points_level, np.float64) * s + (s - 1.0) / 2.0
+
+
+def to_level(points_full: ArrayLike, scale: tuple[float, float]) -> FloatArray:
+    """Full-size pixels (..., 2) to level pixels; the inverse of `to_full`."""
+    s = np.asarray(scale, np.float64)
+    return (np.asarray(points_full, np.float64) - (s - 1.0) / 2.0) / s
+
+
+def default_anchors(size_px: tuple[int, int]) -> FloatArray:
+    """The four anchors (4, 2) of a w x h picture: its corners drawn in by 10 % of each side."""
+    w, h = size_px
+    x0, x1 = 0.1 * (w - 1), 0.9 * (w - 1)
+    y0, y1 = 0.1 * (h - 1), 0.9 * (h - 1)
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def transfer_jacobian(H: FloatArray, points: FloatArray) -> FloatArray:
+    """d transfer(H, points) / d vec(H), row-major: (n, 2, 9)."""
+    x = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    y = x @ H.T
+    w = y[:, 2:3]
+    q = y[:, :2] / w
+    J = np.zeros((len(points), 2, 9))
+    J[:, 0, 0:3] = x / w
+    J[:, 1, 3:6] = x / w
+    J[:, 0, 6:9] = -q[:, :1] * x / w
+    J[:, 1, 6:9] = -q[:, 1:] * x / w
+    return J
+
+
+def fit_homography_to_flow(
+    src: FloatArray, dst: FloatArray, info: FloatArray, H_start: FloatArray, ridge_px: float = 100.0
+) -> tuple[FloatArray, FloatArray]:
+    """Homography nearest to measured points, and the information (9, 9) on vec(H) at the solution.
+
+    src, dst: (m, 2) px; info: (m, 2, 2) px^-2 of dst. Gauss-Newton from H_start, in coordinates scaled by the
+    spread of the points. `ridge_px` is a weak pull towards H_start: the std, in px at the points, that a
+    direction without evidence keeps. Returns (H det 1, information of vec(H) of that scale, row-major).
+    """
+    H0 = normalise_homography(H_start)
+    H = H0.copy()
+    N = np.zeros((9, 9))
+    for _ in range(4):
+        J = transfer_jacobian(H, src)
+        r = dst - transfer(H, src)
+        r0 = transfer(H0, src) - transfer(H, src)
+        JW = np.einsum("nia,nij->naj", J, info)
+        N = np.einsum("naj,njb->ab", JW, J)
+        JR = np.einsum("nia,nib->ab", J, J) / (ridge_px**2)
+        g = np.einsum("naj,nj->a", JW, r) + np.einsum("nia,ni->a", J, r0) / ridge_px**2
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(N + JR), 1e-300))
+        M = (N + JR) * scale[:, None] * scale[None, :]
+        # vec(H) has one free scale: a unit of curvature along H itself keeps the system regular.
+        h = H.ravel() / scale
+        h /= np.linalg.norm(h)
+        step = scale * np.linalg.solve(M + np.outer(h, h) + 1e-12 * np.eye(9), scale * g)
+        if not np.all(np.isfinite(step)):
+            break
+        H = normalise_homography(H + step.reshape(3, 3))
+    return H, N
+
+
+def anchor_information(H: FloatArray, N: FloatArray, anchors: FloatArray) -> FloatArray:
+    """Information (8, 8) of the four transferred anchors, from N (9, 9) on vec(H) (calibration.md 3.5)."""
+    J = transfer_jacobian(H, anchors).reshape(8, 9)
+    # Eight anchors' coordinates determine vec(H) up to scale: invert the chart on the complement of H.
+    h = H.ravel() / np.linalg.norm(H)
+    back = np.linalg.pinv(np.vstack([J, h[None, :] * np.linalg.norm(J)]))[:, :8]
+    return back.T @ N @ back

@@ -1,0 +1,225 @@
+"""Pictures of the chosen frames, kept in one scratch file on disk between the two passes over a clip.
+
+Read with preadv into arrays of our own: a memory map would count every page touched as resident. What stays in
+memory is a small cache and, per frame, a coarse picture for the photometry. It knows nothing of geometry.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+COARSE = 16  # px of a frame per pixel of its coarse picture
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StoredFrame:
+    """rgb (h, w, 3) uint8; trust (h, w) uint8 or None: 0 = not the scene, 255 = scene at rest, None = 255 all over.
+
+    Both are smaller by the whole factor `shrink` where a reduced copy was asked for: full px = shrink * px +
+    (shrink - 1) / 2.
+    """
+
+    rgb: NDArray[np.uint8]
+    trust: NDArray[np.uint8] | None
+    shrink: int = 1
+
+
+class FrameStore:
+    """Scratch store of frames of one size. Safe to read from several threads; write from one.
+
+    folder: where the scratch file is made (removed again by close()). cache_bytes bounds the frames held in memory.
+    mask_margin_px: a mask is widened by this much, because a codec smears an overlay's edge over its neighbours.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        size_px: tuple[int, int],
+        *,
+        cache_bytes: int = 160_000_000,
+        mask_margin_px: int = 3,
+    ) -> None:
+        self.size_px = (int(size_px[0]), int(size_px[1]))
+        if min(self.size_px) < COARSE:
+            raise ValueError(f"frames of {size_px} px are too small for a panorama, need {COARSE} each way")
+        self.cache_bytes = int(cache_bytes)
+        self.mask_margin_px = int(mask_margin_px)
+        handle, name = tempfile.mkstemp(prefix="frames-", suffix=".raw", dir=folder)
+        self._file, self._path = handle, Path(name)
+        self._end = 0
+        self._offset: dict[int, int] = {}
+        self._trust_of: dict[int, int] = {}  # frame -> offset of its trust plane
+        self._trust_known: dict[bytes, int] = {}  # digest -> offset: a static overlay is stored once
+        self._trust_kept: tuple[int, NDArray[np.uint8]] | None = None
+        self._last_mask: tuple[NDArray[np.bool_], NDArray[np.uint8]] | None = None
+        self._coarse: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
+        self._cache: OrderedDict[tuple[int, int], StoredFrame] = OrderedDict()
+        self._cached_bytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Frame numbers stored, in ascending order."""
+        return tuple(sorted(self._offset))
+
+    @property
+    def bytes_on_disk(self) -> int:
+        return self._end
+
+    def __contains__(self, frame: int) -> bool:
+        return frame in self._offset
+
+    def put(
+        self,
+        frame: int,
+        rgb: NDArray[np.uint8],
+        mask: NDArray[np.bool_] | None = None,
+        trust: NDArray[np.uint8] | NDArray[np.floating] | None = None,
+    ) -> None:
+        """Store one frame.
+
+        rgb (h, w, 3) uint8. mask (h, w) bool, True = usable scene. trust (h, w): how sure it is that a pixel shows
+        the scene at rest, float 0..1 or uint8 0..255; low where something moves. Raises ValueError on a wrong
+        shape or dtype, or a frame that is already there.
+        """
+        width, height = self.size_px
+        if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
+            raise ValueError(f"frame {frame} is {rgb.dtype} {rgb.shape}, need uint8 {(height, width, 3)}")
+        if frame in self._offset:
+            raise ValueError(f"frame {frame} is stored already")
+        plane = self._trust_plane(mask, trust)
+        coarse_size = (width // COARSE, height // COARSE)
+        cut = np.s_[: coarse_size[1] * COARSE, : coarse_size[0] * COARSE]
+        coarse = cv2.resize(rgb[cut], coarse_size, interpolation=cv2.INTER_AREA)
+        if plane is None:
+            coarse_trust = np.full(coarse_size[::-1], 255, np.uint8)
+        else:
+            blocks = plane[cut].reshape(coarse_size[1], COARSE, coarse_size[0], COARSE)
+            coarse_trust = blocks.min(axis=(1, 3))  # a block with any masked pixel is not a measurement
+            self._trust_of[frame] = self._put_trust(plane)
+        self._coarse[frame] = (np.asarray(coarse, dtype=np.uint8), coarse_trust)
+        self._offset[frame] = self._append(np.ascontiguousarray(rgb))
+
+    def _trust_plane(
+        self, mask: NDArray[np.bool_] | None, trust: NDArray[np.uint8] | NDArray[np.floating] | None
+    ) -> NDArray[np.uint8] | None:
+        shape = self.size_px[::-1]
+        plane: NDArray[np.uint8] | None = None
+        if mask is not None:
+            if mask.shape != shape or mask.dtype != np.bool_:
+                raise ValueError(f"mask is {mask.dtype} {mask.shape}, need bool {shape}")
+            if self._last_mask is None or not np.array_equal(self._last_mask[0], mask):
+                side = 2 * self.mask_margin_px + 1
+                kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+                # Outside the picture counts as usable, or every frame would lose its border.
+                shrunk = cv2.erode(mask.astype(np.uint8) * 255, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=255)
+                self._last_mask = (mask.copy(), np.asarray(shrunk, dtype=np.uint8))
+            plane = self._last_mask[1]
+        if trust is not None:
+            if trust.shape != shape:
+                raise ValueError(f"trust has shape {trust.shape}, need {shape}")
+            if trust.dtype == np.uint8:
+                level = trust.astype(np.uint8)
+            else:
+                level = np.rint(np.clip(np.nan_to_num(trust, nan=0.0), 0.0, 1.0) * 255).astype(np.uint8)
+            plane = level if plane is None else np.minimum(plane, level)
+        return plane
+
+    def _put_trust(self, plane: NDArray[np.uint8]) -> int:
+        digest = hashlib.blake2b(np.ascontiguousarray(plane), digest_size=16).digest()
+        if digest not in self._trust_known:
+            self._trust_known[digest] = self._append(np.ascontiguousarray(plane))
+        return self._trust_known[digest]
+
+    def _append(self, array: NDArray[np.uint8]) -> int:
+        offset, view = self._end, memoryview(array).cast("B")
+        while view:
+            written = os.pwrite(self._file, view, self._end)
+            self._end += written
+            view = view[written:]
+        return offset
+
+    def _read(self, offset: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+        array = np.empty(shape, np.uint8)
+        view = memoryview(array).cast("B")
+        while view:
+            n_bytes = os.preadv(self._file, [view], offset)
+            if n_bytes == 0:
+                raise OSError(f"scratch file {self._path} ends at byte {offset}: it was cut while in use")
+            offset += n_bytes
+            view = view[n_bytes:]
+        return array
+
+    def get(self, frame: int, shrink: int = 1) -> StoredFrame:
+        """The frame, or its mean over blocks of shrink x shrink px. Raises KeyError for a frame not stored."""
+        key = (frame, shrink)
+        with self._lock:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        width, height = self.size_px
+        rgb = self._read(self._offset[frame], (height, width, 3))
+        trust = self._read_trust(frame)
+        if shrink > 1:
+            small = (width // shrink, height // shrink)
+            cut = np.s_[: small[1] * shrink, : small[0] * shrink]
+            rgb = np.asarray(cv2.resize(rgb[cut], small, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            if trust is not None:
+                trust = trust[cut].reshape(small[1], shrink, small[0], shrink).min(axis=(1, 3))
+        stored = StoredFrame(rgb=rgb, trust=trust, shrink=shrink)
+        with self._lock:
+            self._remember(key, stored)
+        return stored
+
+    def _read_trust(self, frame: int) -> NDArray[np.uint8] | None:
+        offset = self._trust_of.get(frame)
+        if offset is None:
+            return None
+        with self._lock:
+            if self._trust_kept is not None and self._trust_kept[0] == offset:
+                return self._trust_kept[1]
+        plane = self._read(offset, self.size_px[::-1])
+        with self._lock:
+            self._trust_kept = (offset, plane)
+        return plane
+
+    def _remember(self, key: tuple[int, int], stored: StoredFrame) -> None:
+        if key in self._cache:
+            return
+        self._cache[key] = stored
+        self._cached_bytes += stored.rgb.nbytes
+        while self._cached_bytes > self.cache_bytes and len(self._cache) > 1:
+            _, dropped = self._cache.popitem(last=False)
+            self._cached_bytes -= dropped.rgb.nbytes
+
+    def coarse(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Mean colour (h/16, w/16, 3) and least trust (h/16, w/16) of blocks of 16 x 16 px, both uint8."""
+        return self._coarse[frame]
+
+    def close(self) -> None:
+        """Remove the scratch file. May be called twice."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+            self._path.unlink(missing_ok=True)
+            self._cache.clear()
+            self._cached_bytes = 0
+
+    def __enter__(self) -> FrameStore:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

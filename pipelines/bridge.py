@@ -1,0 +1,219 @@
+"""Between images and calibration: the one place where mosaic's measurements and calib's cameras meet.
+
+Makes the rotation + zoom + distortion warp family out of calib's camera (so that mosaic registers in four
+parameters without knowing a focal length), edges out of pair fits, and placements out of solved cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.records import HomographyEdge, HomographyGraph, Lens
+from calib import rotation
+from mosaic.records import PairFit
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraPose:
+    """One frame's camera in the shot world: log focal (px) and R_cam_world (3, 3)."""
+
+    log_f: float
+    R: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PairState:
+    """State of the rotation + zoom family: the target's log focal and R_dst_src."""
+
+    log_f: float
+    R_dst_src: FloatArray
+
+
+@nb.njit(cache=True, nogil=True)
+def _rotation_zoom_warp(rays, B, R, f, aspect, k, dk, pp_x, pp_y, half_width):  # type: ignore[no-untyped-def]
+    """Rays (n, 3) of the source to raw target px; J (n, 2, 4) of (d log f, left rotation); A (n, 2, 2).
+
+    B (n, 2, 2) = d ray[:2] / d raw source px. calibration.md 6.3 with the source camera held.
+    """
+    n = rays.shape[0]
+    dst = np.empty((n, 2))
+    J = np.zeros((n, 2, 4), np.float32)
+    A = np.empty((n, 2, 2))
+    fy = f / aspect
+    s2 = half_width * half_width
+    for i in range(n):
+        m0 = rays[i, 0]
+        m1 = rays[i, 1]
+        m2 = rays[i, 2]
+        w0 = R[0, 0] * m0 + R[0, 1] * m1 + R[0, 2] * m2
+        w1 = R[1, 0] * m0 + R[1, 1] * m1 + R[1, 2] * m2
+        w2 = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2
+        A[i, 0, 0] = 1.0
+        A[i, 0, 1] = 0.0
+        A[i, 1, 0] = 0.0
+        A[i, 1, 1] = 1.0
+        if not w2 > 1e-6:
+            dst[i, 0] = np.nan
+            dst[i, 1] = np.nan
+            continue
+        q0 = w0 / w2
+        q1 = w1 / w2
+        dx = f * q0
+        dy = fy * q1
+        rho2 = (dx * dx + dy * dy) / s2
+        if 1.0 + 3.0 * k * rho2 <= 0.05:
+            dst[i, 0] = np.nan
+            dst[i, 1] = np.nan
+            continue
+        g = 1.0 + k * rho2
+        dst[i, 0] = pp_x + dx * g
+        dst[i, 1] = pp_y + dy * g
+        e = 2.0 * k / s2
+        D00 = g + e * dx * dx
+        D01 = e * dx * dy
+        D11 = g + e * dy * dy
+        J[i, 0, 0] = D00 * dx + D01 * dy + dx * rho2 * dk
+        J[i, 1, 0] = D01 * dx + D11 * dy + dy * rho2 * dk
+        # G = D diag(f, fy) d q / d w
+        a0 = f / w2
+        a1 = fy / w2
+        g00 = D00 * a0
+        g01 = D01 * a1
+        g02 = -(D00 * a0 * q0 + D01 * a1 * q1)
+        g10 = D01 * a0
+        g11 = D11 * a1
+        g12 = -(D01 * a0 * q0 + D11 * a1 * q1)
+        # d w = delta x w
+        J[i, 0, 1] = -g01 * w2 + g02 * w1
+        J[i, 0, 2] = g00 * w2 - g02 * w0
+        J[i, 0, 3] = -g00 * w1 + g01 * w0
+        J[i, 1, 1] = -g11 * w2 + g12 * w1
+        J[i, 1, 2] = g10 * w2 - g12 * w0
+        J[i, 1, 3] = -g10 * w1 + g11 * w0
+        h00 = g00 * R[0, 0] + g01 * R[1, 0] + g02 * R[2, 0]
+        h01 = g00 * R[0, 1] + g01 * R[1, 1] + g02 * R[2, 1]
+        h10 = g10 * R[0, 0] + g11 * R[1, 0] + g12 * R[2, 0]
+        h11 = g10 * R[0, 1] + g11 * R[1, 1] + g12 * R[2, 1]
+        A[i, 0, 0] = h00 * B[i, 0, 0] + h01 * B[i, 1, 0]
+        A[i, 0, 1] = h00 * B[i, 0, 1] + h01 * B[i, 1, 1]
+        A[i, 1, 0] = h10 * B[i, 0, 0] + h11 * B[i, 1, 0]
+        A[i, 1, 1] = h10 * B[i, 0, 1] + h11 * B[i, 1, 1]
+    return dst, J, A
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RotationZoomFamily:
+    """Rotation + zoom from one source camera through a known lens: 4 parameters (a `mosaic.warp.WarpFamily`).
+
+    The source's focal is held; the state carries the target's focal and R_dst_src. With a wrong focal it is still a
+    good alignment over small angles; the residual-flow grid measures what it cannot express.
+    """
+
+    lens: Lens
+    log_f_src: float
+    n_parameters: int = 4
+
+    def prepare(self, src_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rays (n, 3) with z = 1 of raw source pixels, and d ray[:2] / d raw px (n, 2, 2)."""
+        lens = self.lens
+        f = np.exp(self.log_f_src)
+        ideal = lens.undistort(src_px, self.log_f_src)
+        d = ideal - lens.pp_px
+        s2 = (lens.size_px[0] / 2.0) ** 2
+        k = float(lens.k1_half(self.log_f_src))
+        g = 1.0 + k * (d**2).sum(axis=-1) / s2
+        D = g[:, None, None] * np.eye(2) + (2 * k / s2) * d[:, :, None] * d[:, None, :]
+        inverse_f = np.array([1.0 / f, lens.aspect / f])
+        rays = np.concatenate([d * inverse_f, np.ones((len(d), 1))], axis=1)
+        return np.ascontiguousarray(rays), np.ascontiguousarray(inverse_f[:, None] * np.linalg.inv(D))
+
+    def warp(self, state: PairState, prepared: Any) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
+        """See mosaic.warp.WarpFamily.warp."""
+        lens = self.lens
+        return _rotation_zoom_warp(
+            *prepared,
+            np.ascontiguousarray(state.R_dst_src),
+            float(np.exp(state.log_f)),
+            float(lens.aspect),
+            float(lens.k1_half(state.log_f)),
+            float(lens.c1),
+            float(lens.pp_px[0]),
+            float(lens.pp_px[1]),
+            lens.size_px[0] / 2.0,
+        )
+
+    def update(self, state: PairState, step: FloatArray) -> PairState:
+        """Left increment of the rotation, re-orthonormalised (real-footage.md 7.3); clamped to a sane step."""
+        return PairState(
+            state.log_f + float(np.clip(step[0], -0.3, 0.3)), rotation.orthonormalise(rotation.exp(step[1:]) @ state.R_dst_src)
+        )
+
+
+def pair_state(src: CameraPose, dst: CameraPose) -> PairState:
+    """The family's state between two cameras of one world."""
+    return PairState(dst.log_f, rotation.orthonormalise(dst.R @ src.R.T))
+
+
+def pose_from_state(src: CameraPose, state: PairState) -> CameraPose:
+    """The target's camera in the source's world."""
+    return CameraPose(log_f=state.log_f, R=rotation.orthonormalise(state.R_dst_src @ src.R))
+
+
+def edge_from_fit(fit: PairFit) -> HomographyEdge:
+    """calib's edge from a usable pair fit; a weak fit carries four times the variance."""
+    return HomographyEdge(
+        a=fit.src,
+        b=fit.dst,
+        H=fit.H_dst_src,
+        grid_a=fit.flow.src_px,
+        grid_b=fit.flow.dst_px,
+        info=fit.flow.info,
+        kappa=1.0 if fit.status == "ok" else 4.0,
+    )
+
+
+def homography_graph(frames: ArrayLike, fits: Iterable[PairFit], size_px: tuple[int, int]) -> HomographyGraph:
+    """calib's graph of the usable pair fits between the given frames."""
+    known = set(np.asarray(frames).tolist())
+    edges = tuple(edge_from_fit(f) for f in fits if f.usable and f.src in known and f.dst in known)
+    return HomographyGraph(frames=np.asarray(frames, np.int64), edges=edges, size_px=size_px)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraPlacement:
+    """A solved camera as the compositor sees it: rays of the shot world to raw pixels and back (mosaic's Placement)."""
+
+    frame: int
+    size_px: tuple[int, int]
+    lens: Lens
+    pose: CameraPose
+    blur_px: float = 0.0
+
+    @property
+    def px_per_rad(self) -> float:
+        """Pixels per radian at the centre of the frame."""
+        return float(np.exp(self.pose.log_f))
+
+    def ray_to_pixel(self, rays: ArrayLike) -> FloatArray:
+        """World rays (..., 3) to raw px (..., 2); NaN behind the camera or outside the distortion model."""
+        axes = np.asarray(rays, np.float64) @ self.pose.R.T
+        f = np.exp(self.pose.log_f)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            q = np.where(axes[..., 2:] > 1e-6, axes[..., :2] / axes[..., 2:], np.nan)
+        ideal = self.lens.pp_px + q * np.array([f, f / self.lens.aspect])
+        return self.lens.distort(ideal, self.pose.log_f)
+
+    def pixel_to_ray(self, xy: ArrayLike) -> FloatArray:
+        """Raw px (..., 2) to unit world rays (..., 3)."""
+        f = np.exp(self.pose.log_f)
+        d = (self.lens.undistort(xy, self.pose.log_f) - self.lens.pp_px) / np.array([f, f / self.lens.aspect])
+        ray = np.concatenate([d, np.ones((*d.shape[:-1], 1))], axis=-1)
+        return (ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ self.pose.R

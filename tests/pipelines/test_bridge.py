@@ -1,0 +1,58 @@
+"""The rotation + zoom family: points against calib's camera, Jacobian and A against central differences."""
+
+import numpy as np
+import pytest
+
+from calib import rotation
+from calib.records import Lens
+from pipelines.bridge import CameraPlacement, CameraPose, PairState, RotationZoomFamily, pair_state
+
+SIZE = (1920, 1080)
+
+
+def family_and_state(k=0.04, c1=-0.02):
+    lens = Lens(size_px=SIZE, pp_px=np.array([965.0, 530.0]), aspect=1.02, c0=k, c1=c1)
+    src = CameraPose(log_f=np.log(2500.0), R=rotation.exp([0.02, -0.05, 0.01]))
+    dst = CameraPose(log_f=np.log(3100.0), R=rotation.exp([0.03, 0.04, -0.02]))
+    return lens, src, dst, RotationZoomFamily(lens=lens, log_f_src=src.log_f), pair_state(src, dst)
+
+
+POINTS = np.random.default_rng(0).uniform((0, 0), (1919, 1079), (200, 2))
+
+
+def test_points_equal_the_cameras_placements():
+    lens, src, dst, family, state = family_and_state()
+    where, _, _ = family.warp(state, family.prepare(POINTS))
+    rays = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=src).pixel_to_ray(POINTS)
+    expected = CameraPlacement(frame=1, size_px=SIZE, lens=lens, pose=dst).ray_to_pixel(rays)
+    np.testing.assert_allclose(where, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("parameter", range(4))
+def test_jacobian_against_central_differences(parameter):
+    _, _, _, family, state = family_and_state()
+    prepared = family.prepare(POINTS)
+    _, J, _ = family.warp(state, prepared)
+    step = np.zeros(4)
+    step[parameter] = 1e-5
+    plus, _, _ = family.warp(family.update(state, step), prepared)
+    minus, _, _ = family.warp(family.update(state, -step), prepared)
+    numeric = (plus - minus) / 2e-5
+    np.testing.assert_allclose(J[:, :, parameter], numeric, rtol=2e-5, atol=1e-2)
+
+
+def test_source_derivative_against_central_differences():
+    _, _, _, family, state = family_and_state()
+    _, _, A = family.warp(state, family.prepare(POINTS))
+    for axis in range(2):
+        h = np.zeros(2)
+        h[axis] = 1e-3
+        plus, _, _ = family.warp(state, family.prepare(POINTS + h))
+        minus, _, _ = family.warp(state, family.prepare(POINTS - h))
+        np.testing.assert_allclose(A[:, :, axis], (plus - minus) / 2e-3, atol=1e-6)
+
+
+def test_points_behind_the_camera_are_nan():
+    _, _, _, family, _ = family_and_state()
+    where, _, _ = family.warp(PairState(np.log(2500.0), rotation.exp([0.0, np.pi, 0.0])), family.prepare(POINTS))
+    assert np.isnan(where).all()
