@@ -1,0 +1,428 @@
+"""A file or a folder of images to pictures with their times: `open_clip`, `Clip`, `Frame`, `ClipFacts`.
+
+Gray is the Y plane as it lies in the decoder's memory: no colour conversion (which costs three times the copy),
+limited range left as it is. The header's count of frames is never believed, and a damaged packet does not end
+a clip. Overlays, duplicates and shots are found elsewhere.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import queue
+import threading
+import weakref
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.video.reformatter import Colorspace
+from numpy.typing import NDArray
+
+from pipelines.config import DecodeOptions
+from pipelines.errors import InputError
+from pipelines.picture import Picture
+from pipelines.sources import Source, list_images, open_source
+from pipelines.timing import PtsRepair, Timecode
+
+UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """One picture.
+
+    index: output picture from 0. source_frame: decoded frame it comes from; field: 0 or 1 in order of time where that
+    frame was interlaced, else None. pts_s: s, strictly increasing. timecode: 'hh:mm:ss:ff' or ''.
+    gray: (h, w) uint8 as decoded, or float32 0..255 from sources of more than 8 bits; owned, read-only.
+    mask: (h, w) bool, True = usable; None = all of it. pixel_aspect: width over height of a pixel.
+    picture: () -> (h, w, 3) uint8 RGB of this frame; it keeps the decoder's picture alive (3 MB at 1080p) while held.
+    """
+
+    index: int
+    pts_s: float
+    timecode: str
+    source_frame: int
+    field: int | None
+    gray: NDArray[Any]
+    mask: NDArray[np.bool_] | None
+    pixel_aspect: float
+    picture: Callable[[], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ClipFacts:
+    """What the container and the first picture say. `warnings` grows while the clip is decoded; the rest is fixed.
+
+    size_px: (w, h) of the pictures handed out, after rotation. fps: decoded frames/s by the header, NaN unknown;
+    picture_fps: pictures handed out per s (twice fps where fields are). n_frames_header: as the header claims, or None.
+    colour: space, range, primaries, transfer as FFmpeg's numbers and the matrix used for RGB. rotation_deg: applied,
+    counter-clockwise. deinterlace: 'none', 'bwdif send_field' or 'bwdif send_frame'. timecode: of picture 0, or ''.
+    """
+
+    path: Path
+    size_px: tuple[int, int]
+    fps: float
+    picture_fps: float
+    n_frames_header: int | None
+    duration_s: float
+    container: str
+    codec: str
+    pix_fmt: str
+    bit_depth: int
+    colour: dict[str, Any]
+    interlaced: bool
+    deinterlace: str
+    pixel_aspect: float
+    rotation_deg: int
+    timecode: str
+    size_bytes: int
+    mtime_ns: int
+    warnings: list[str] = field(default_factory=list)
+
+    def sha256(self) -> str:
+        """Of the whole file; of all images, names and contents, for a folder. Reads everything: not for each run."""
+        digest = hashlib.sha256()
+        for path in _files_of(self.path):
+            if path != self.path:
+                digest.update(path.name.encode())
+            with path.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+        return digest.hexdigest()
+
+    def identity(self) -> str:
+        """A quick digest that changes when the clip does: size, and first and last MB; not its time stamp or name."""
+        digest = hashlib.sha256()
+        for path in _files_of(self.path):
+            size = path.stat().st_size
+            digest.update(f"{path.name if path != self.path else ''}:{size};".encode())
+            with path.open("rb") as stream:
+                digest.update(stream.read(1 << 20))
+                stream.seek(max(0, size - (1 << 20)))
+                digest.update(stream.read(1 << 20))
+        return digest.hexdigest()
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready, for run.json and probe; NaN becomes None."""
+        values: dict[str, Any] = {}
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if isinstance(value, Path):
+                value = str(value)
+            elif isinstance(value, float) and not np.isfinite(value):
+                value = None
+            elif isinstance(value, tuple | list):
+                value = list(value)
+            values[name] = value
+        return values
+
+
+class Clip:
+    """An opened clip. Iterating decodes it from the start, ahead in a thread of its own; any number of times.
+
+    `with open_clip(path) as clip: for frame in clip: ...`. `counts` (after an iteration): frames decoded, packets
+    that failed, time stamps repaired, gaps. Raises InputError at the end of an iteration that found under two pictures.
+    """
+
+    def __init__(self, facts: ClipFacts, options: DecodeOptions) -> None:
+        self.facts = facts
+        self.options = options
+        self.counts: dict[str, int] = {}
+        self._readers: weakref.WeakSet[_Reader] = weakref.WeakSet()
+        self._told: set[str] = set()
+
+    def __enter__(self) -> Clip:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop every decoder thread of this clip and let go of the file."""
+        for reader in list(self._readers):
+            reader.stop()
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self.frames()
+
+    def frames(
+        self, first: int = 0, count: int | None = None, only: Collection[int] | None = None
+    ) -> Iterator[Frame]:
+        """Pictures first, first + 1 ... (`count` of them), or of those only the ones in `only`.
+
+        Always decodes from the start: seeking is inexact in transport streams. What is skipped costs no copy.
+        """
+        last = None if count is None else first + count - 1
+        if only is not None:
+            only = frozenset(only)
+            last = max(only, default=-1) if last is None else min(last, max(only, default=-1))
+        reader = _Reader(self.facts, self.options, first, last, only)
+        self._readers.add(reader)
+        try:
+            yield from reader
+        finally:
+            reader.stop()
+            self.counts = dict(reader.counts)
+            for warning in reader.warnings:
+                if warning not in self._told:
+                    self._told.add(warning)
+                    self.facts.warnings.append(warning)
+
+
+def open_clip(path: str | Path, options: DecodeOptions | None = None) -> Clip:
+    """Open a video file, a folder of images or a pattern like frames/%06d.png, and read its first picture.
+
+    Raises InputError: no such file, not a video, truncated, audio only, no images, nothing decodable, too large.
+    """
+    options = options or DecodeOptions()
+    path = Path(path)
+    with open_source(path, options) as source:
+        first = next(source.pictures(), None)
+        if first is None:
+            raise InputError(path, "no picture could be decoded", "it is damaged, or its codec is not in this FFmpeg")
+        return Clip(_facts(source, first, options), options)
+
+
+def _facts(source: Source, first: Picture, options: DecodeOptions) -> ClipFacts:
+    video = first.video
+    turns = _quarter_turns(video)
+    warnings = list(source.warnings)
+    width, height = (video.width, video.height) if turns % 2 == 0 else (video.height, video.width)
+    # The picture's own flag decides: stream headers call plenty of progressive material interlaced.
+    interlaced = bool(video.interlaced_frame)
+    if source.says_interlaced and not interlaced:
+        warnings.append("the stream calls itself interlaced, its first picture is not: each is judged by itself")
+    mode = "none" if not interlaced or options.deinterlace == "off" else f"bwdif send_{options.deinterlace}"
+    if interlaced:
+        how = {"off": "left combed", "field": "one picture a field", "frame": "one picture a frame"}
+        warnings.append(f"interlaced: {how[options.deinterlace]} (deinterlacing: {mode})")
+    aspect = options.pixel_aspect or source.pixel_aspect or 1.0
+    if turns:
+        warnings.append(f"rotated by {90 * turns} degrees counter-clockwise, as the file asks")
+        aspect = aspect if turns % 2 == 0 or options.pixel_aspect else 1.0 / aspect
+    stat = source.path.stat() if source.path.exists() else None
+    timecode = source.timecode or _gop_timecode(video, source.fps)
+    if timecode is not None and timecode.count == 0 and not options.accept_zero_timecode:
+        timecode = None
+    return ClipFacts(
+        path=source.path,
+        size_px=(width, height),
+        fps=source.fps,
+        picture_fps=source.fps * (2 if mode.endswith("send_field") else 1),
+        n_frames_header=source.n_frames_header,
+        duration_s=source.duration_s,
+        container=source.container_name,
+        codec=source.codec_name,
+        pix_fmt=video.format.name,
+        bit_depth=video.format.components[0].bits,
+        colour={
+            "space": int(video.colorspace),
+            "range": int(video.color_range),
+            "primaries": int(getattr(video, "color_primaries", UNSPECIFIED)),
+            "transfer": int(getattr(video, "color_trc", UNSPECIFIED)),
+            "rgb_matrix": "none" if video.format.is_rgb else Colorspace(_matrix(video)).name,
+        },
+        interlaced=interlaced,
+        deinterlace=mode,
+        pixel_aspect=float(aspect),
+        rotation_deg=90 * turns,
+        timecode=str(timecode) if timecode is not None else "",
+        size_bytes=sum(p.stat().st_size for p in source.files),
+        mtime_ns=stat.st_mtime_ns if stat is not None else 0,
+        warnings=warnings,
+    )
+
+
+# ---- pixels
+
+
+def _gray(video: av.VideoFrame, turns: int) -> NDArray[Any]:
+    """(h, w) luma of a picture, turned upright, owned and read-only: uint8, or float32 0..255 above 8 bits."""
+    name = video.format.name
+    bits = video.format.components[0].bits
+    if not name.startswith(("yuv4", "yuvj4", "yuva4", "gray", "nv12", "nv21", "nv16")) or name.startswith("grayf"):
+        # RGB, packed and shifted layouts: one conversion to a plain plane; of 16 bits, because 10-bit to 8 dithers.
+        packed_yuv = not video.format.is_rgb and not video.format.has_palette and len(video.format.components) > 2
+        plain = ("yuv422p" if packed_yuv else "gray") if bits <= 8 else ("yuv444p16le" if packed_yuv else "gray16le")
+        video = video.reformat(format=plain)
+        name, bits = plain, (8 if bits <= 8 else 16)
+    plane: Any = video.planes[0]  # has the buffer protocol
+    sample: np.dtype[Any] = np.dtype(np.uint8) if bits <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
+    padded = np.frombuffer(plane, sample).reshape(plane.height, plane.line_size // sample.itemsize)
+    view = np.rot90(padded[:, : video.width], turns)
+    # The copy detaches the picture from the decoder's pool, so that keeping a frame costs 2 MB, not a pool.
+    gray = np.array(view, np.uint8, order="C") if bits <= 8 else view.astype(np.float32) / np.float32(1 << (bits - 8))
+    gray = np.ascontiguousarray(gray)
+    gray.setflags(write=False)
+    return gray
+
+
+def _rgb(video: av.VideoFrame, turns: int) -> NDArray[np.uint8]:
+    """(h, w, 3) RGB of a picture, turned upright."""
+    if video.format.is_rgb or video.format.has_palette:
+        rgb = video.to_ndarray(format="rgb24")
+    else:
+        rgb = video.reformat(format="rgb24", src_colorspace=_matrix(video)).to_ndarray()
+    return np.ascontiguousarray(np.rot90(rgb, turns))
+
+
+def _matrix(video: av.VideoFrame) -> Colorspace:
+    """The YCbCr matrix: as tagged; untagged, BT.709 from 720 lines up (FFmpeg would take BT.601: red turns orange)."""
+    tagged = int(video.colorspace)
+    known = {1: Colorspace.ITU709, 4: Colorspace.FCC, 5: Colorspace.ITU601, 6: Colorspace.ITU601,
+             7: Colorspace.SMPTE240M, 9: Colorspace.BT2020, 10: Colorspace.BT2020}
+    return known.get(tagged, Colorspace.ITU709 if video.height >= 720 else Colorspace.ITU601)
+
+
+def _quarter_turns(video: av.VideoFrame) -> int:
+    """Quarter turns counter-clockwise that put the picture upright."""
+    return round(int(getattr(video, "rotation", 0) or 0) / 90) % 4
+
+
+def _gop_timecode(video: av.VideoFrame, fps: float) -> Timecode | None:
+    """MPEG-2's time code of the group of pictures, where the first frame carries one."""
+    data: Any = video.side_data.get("GOP_TIMECODE")
+    return Timecode.from_mpeg(int.from_bytes(bytes(data)[:8], "little"), fps) if data is not None else None
+
+
+def _files_of(path: Path) -> list[Path]:
+    return [path] if path.is_file() else list_images(path)
+
+
+# ---- the thread that decodes ahead
+
+_END = object()
+
+
+class _Reader:
+    """Iterates over the frames that a daemon thread puts into a bounded queue; stops it when dropped or at exit."""
+
+    def __init__(
+        self,
+        facts: ClipFacts,
+        options: DecodeOptions,
+        first: int,
+        last: int | None,
+        only: frozenset[int] | Collection[int] | None,
+    ) -> None:
+        names = ("decoded", "pictures", "fields", "failed_packets", "repaired_pts", "gaps")
+        self.counts: dict[str, int] = dict.fromkeys(names, 0)
+        self.warnings: list[str] = []
+        self._queue: queue.Queue[Any] = queue.Queue(maxsize=options.queue_frames)
+        self._stop = threading.Event()
+        what = (facts, options, first, last, only, self.counts, self.warnings)
+        work = partial(_decode_into, self._queue, self._stop, *what)
+        self._thread = threading.Thread(target=work, name="decode", daemon=True)
+        # The thread must not outlive the interpreter inside FFmpeg: finalize also runs at exit, before modules go.
+        self._finalizer = weakref.finalize(self, _shut_down, self._stop, self._queue, self._thread)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[Frame]:
+        while True:
+            item = self._queue.get()
+            if item is _END:
+                return
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+
+    def stop(self) -> None:
+        """End the thread; harmless when it has ended."""
+        self._finalizer()
+
+
+def _shut_down(stop: threading.Event, frames: queue.Queue[Any], thread: threading.Thread) -> None:
+    stop.set()
+    while thread.is_alive():
+        try:
+            while True:
+                frames.get_nowait()
+        except queue.Empty:
+            thread.join(timeout=0.05)
+    # A consumer that still waits in another thread must not wait for ever.
+    frames.put(_END)
+
+
+def _decode_into(
+    frames: queue.Queue[Any],
+    stop: threading.Event,
+    facts: ClipFacts,
+    options: DecodeOptions,
+    first: int,
+    last: int | None,
+    only: Collection[int] | None,
+    counts: dict[str, int],
+    warnings: list[str],
+) -> None:
+    """Body of the thread: everything, errors too, goes through the queue. Returns soon after `stop` is set."""
+
+    def put(item: object) -> None:
+        while not stop.is_set():
+            try:
+                frames.put(item, timeout=0.1)
+                return
+            except queue.Full:
+                continue
+
+    try:
+        for frame in _frames(facts, options, first, last, only, counts, warnings):
+            if stop.is_set():
+                return
+            put(frame)
+        put(_END)
+    except BaseException as error:  # handed to the consumer, who raises it
+        put(error)
+
+
+def _frames(
+    facts: ClipFacts,
+    options: DecodeOptions,
+    first: int,
+    last: int | None,
+    only: Collection[int] | None,
+    counts: dict[str, int],
+    warnings: list[str],
+) -> Iterator[Frame]:
+    turns = facts.rotation_deg // 90
+    timecode = Timecode.parse(facts.timecode, facts.fps) if facts.timecode else None
+    start_s: float | None = None
+    complete = True
+    with open_source(facts.path, options) as source:
+        repair = PtsRepair(facts.fps)
+        pictures = source.fields(repair.apply(source.pictures()), options.deinterlace)
+        for index, picture in enumerate(pictures):
+            if last is not None and index > last:
+                complete = False
+                break
+            start_s = picture.pts_s if start_s is None else start_s
+            counts["pictures"] = index + 1
+            counts["decoded"] = picture.source_frame + 1
+            counts["fields"] += picture.field is not None
+            if index < first or (only is not None and index not in only):
+                continue
+            yield Frame(
+                index=index,
+                pts_s=picture.pts_s,
+                timecode=str(timecode.after(picture.frame_start_s - start_s)) if timecode is not None else "",
+                source_frame=picture.source_frame,
+                field=picture.field,
+                gray=_gray(picture.video, turns),
+                mask=None,
+                pixel_aspect=facts.pixel_aspect,
+                picture=partial(_rgb, picture.video, turns),
+            )
+        counts["failed_packets"] = source.n_failed
+        counts["repaired_pts"] = repair.n_repaired
+        counts["gaps"] = repair.n_gaps
+        if complete and counts["decoded"] < 2:
+            raise InputError(facts.path, "only one picture could be decoded", "a clip needs at least two frames")
+        if complete and counts["pictures"] <= first:
+            raise InputError(facts.path, f"has only {counts['pictures']} pictures", f"start before picture {first}")
+        if complete and 0 < counts["fields"] < counts["pictures"]:
+            warnings.append(f"{counts['fields'] // 2} of {counts['decoded']} frames are interlaced, the others are not")
+        if complete:
+            warnings.extend(source.late_warnings(counts["decoded"]) + repair.warnings())

@@ -1,0 +1,333 @@
+"""Where pictures come from: a container that FFmpeg reads, or a list of image files. Opening, and refusing."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import av
+import av.error
+
+from pipelines.config import DecodeOptions
+from pipelines.deinterlace import deinterlace
+from pipelines.errors import InputError
+from pipelines.picture import Picture
+from pipelines.timing import Timecode
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr", ".dpx", ".jp2", ".ppm", ".pgm")
+
+# Formats that are lists of other files or addresses: a hostile "clip" could read what the user did not name.
+INDIRECT_FORMATS = frozenset({"hls", "concat", "dash", "sdp", "rtsp", "rtp", "imf", "lavfi", "webm_dash_manifest"})
+
+# FFmpeg plays a text file as a picture of a terminal.
+TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf"})
+
+
+class Source(Protocol):
+    """An opened clip as decoding needs it; facts as the header states them (NaN, None: it does not)."""
+
+    path: Path
+    files: list[Path]
+    fps: float
+    n_frames_header: int | None
+    duration_s: float
+    container_name: str
+    codec_name: str
+    pixel_aspect: float | None
+    timecode: Timecode | None
+    says_interlaced: bool
+    warnings: list[str]
+    n_failed: int
+
+    def __enter__(self) -> Self: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+    def pictures(self) -> Iterator[Picture]: ...
+    def fields(self, pictures: Iterable[Picture], mode: str) -> Iterator[Picture]: ...
+    def late_warnings(self, n_decoded: int) -> list[str]: ...
+
+
+def open_source(path: Path, options: DecodeOptions) -> Source:
+    """A container or images, by what the path is. Raises InputError with file, cause and cure."""
+    if path.is_dir() or (re.search(r"%0?\d*d", path.name) and not path.exists()):
+        files = list_images(path)
+        if not files:
+            cause = "no images in it" if path.is_dir() else "no file matches the pattern"
+            raise InputError(path, cause, f"it must hold numbered images ({', '.join(IMAGE_SUFFIXES[:3])} ...)")
+        return ImageSource(path, files, options)
+    return ContainerSource(path, options)
+
+
+def list_images(path: Path) -> list[Path]:
+    """The images of a folder, or those that match frames/%06d.png, in the order of the numbers in their names."""
+    if path.is_dir():
+        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    else:
+        pattern = re.compile(re.sub(r"%0?\d*d", r"\\d+", re.escape(path.name).replace("\\%", "%")))
+        parent = path.parent if path.parent.is_dir() else None
+        found = [p for p in parent.iterdir() if pattern.fullmatch(p.name)] if parent is not None else []
+
+    def numbers(p: Path) -> list[Any]:
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)]
+
+    return sorted(found, key=numbers)
+
+
+class ContainerSource:
+    """A file that FFmpeg demultiplexes; its first real video stream."""
+
+    def __init__(self, path: Path, options: DecodeOptions) -> None:
+        self.path = path
+        self.files = [path]
+        self.n_failed = 0
+        self.warnings: list[str] = []
+        self._n_other_size = 0
+        self._container = _open(path)
+        try:
+            stream = _video_stream(self._container, path)
+            _refuse_size(path, stream.width, stream.height, options)
+        except BaseException:
+            self._container.close()
+            raise
+        cores = os.cpu_count() or 1
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = options.threads or (1 if cores <= 2 else min(4, cores))
+        self._stream = stream
+        self.fps = _rate(stream)
+        self.n_frames_header = int(stream.frames) or None
+        self.duration_s = _duration(self._container, stream)
+        self.container_name = self._container.format.name
+        self.codec_name = stream.codec_context.codec.canonical_name
+        ratio = stream.sample_aspect_ratio
+        self.pixel_aspect = float(ratio) if ratio else None
+        self.timecode = self._find_timecode()
+        # FFmpeg's AVFieldOrder: 2 .. 5 are the interlaced ones.
+        self.says_interlaced = int(getattr(stream.codec_context, "field_order", 0) or 0) >= 2
+        others = [s for s in self._container.streams.video if s is not stream and s.codec_context is not None]
+        if others:
+            self.warnings.append(f"{1 + len(others)} video streams; only stream {stream.index} is used")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._container.close()
+
+    def pictures(self) -> Iterator[Picture]:
+        """Every picture that decodes, in order of presentation. A packet that fails is counted and left out."""
+        number = 0
+        size: tuple[int, int] | None = None
+        frame: Any
+        for frame in self._decoded():
+            size = size or (frame.width, frame.height)
+            if (frame.width, frame.height) != size:
+                self._n_other_size += 1
+                continue
+            unknown = frame.pts is None or not frame.time_base
+            pts_s = math.nan if unknown else float(frame.pts * frame.time_base)
+            yield Picture(video=frame, source_frame=number, pts_s=pts_s, frame_start_s=pts_s)
+            number += 1
+
+    def _decoded(self) -> Iterator[av.VideoFrame]:
+        packets = self._container.demux(self._stream)
+        while True:
+            try:
+                packet = next(packets, None)
+            except (av.error.FFmpegError, OSError) as error:
+                self.n_failed += 1
+                self.warnings.append(f"reading stopped early: {error}")
+                return
+            if packet is None:
+                return
+            try:
+                frames = packet.decode()
+            except av.error.FFmpegError:
+                self.n_failed += 1
+                continue
+            yield from frames
+
+    def fields(self, pictures: Iterable[Picture], mode: str) -> Iterator[Picture]:
+        return deinterlace(pictures, mode)
+
+    def late_warnings(self, n_decoded: int) -> list[str]:
+        """What is known only after the last picture."""
+        found = list(self.warnings)
+        if self.n_frames_header is not None and self.n_frames_header != n_decoded:
+            found.append(f"the header promises {self.n_frames_header} frames, {n_decoded} could be decoded")
+        if self.n_failed:
+            found.append(f"{self.n_failed} damaged packets were left out")
+        if self._n_other_size:
+            found.append(f"{self._n_other_size} frames of another size were left out")
+        return found
+
+    def _find_timecode(self) -> Timecode | None:
+        for tags in (self._stream.metadata, self._container.metadata, *(s.metadata for s in self._container.streams)):
+            if "timecode" in tags:
+                found = Timecode.parse(tags["timecode"], self.fps)
+                if found is not None:
+                    return found
+        return None
+
+
+class ImageSource:
+    """Image files, one picture each; the rate is the user's, the files have none."""
+
+    n_frames_header: int | None
+    duration_s: float
+    pixel_aspect: float | None
+    timecode: Timecode | None
+
+    def __init__(self, path: Path, files: list[Path], options: DecodeOptions) -> None:
+        self.path = path
+        self.files = files
+        self.fps = options.image_fps
+        self.n_frames_header = len(files)
+        self.duration_s = len(files) / options.image_fps
+        self.container_name = "images"
+        self.codec_name = files[0].suffix[1:].lower()
+        self.pixel_aspect = None
+        self.timecode = None
+        self.says_interlaced = False
+        self.n_failed = 0
+        self.warnings = [f"images carry no time: {options.image_fps:g} pictures/s taken (decode.image_fps)"]
+        self._options = options
+        self._other_size: list[str] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def pictures(self) -> Iterator[Picture]:
+        """One picture a file, in order; a file that does not decode is counted and leaves a gap in time."""
+        size: tuple[int, int] | None = None
+        number = 0
+        for position, file in enumerate(self.files):
+            try:
+                with av.open(f"file:{file}", metadata_errors="replace") as container:
+                    stream = _video_stream(container, file)
+                    _refuse_size(file, stream.width, stream.height, self._options)
+                    frame = next(container.decode(stream), None)
+            except (av.error.FFmpegError, OSError):
+                frame = None
+            if frame is None:
+                self.n_failed += 1
+                continue
+            size = size or (frame.width, frame.height)
+            if (frame.width, frame.height) != size:
+                self._other_size.append(file.name)
+                continue
+            pts_s = position / self.fps
+            yield Picture(video=frame, source_frame=number, pts_s=pts_s, frame_start_s=pts_s)
+            number += 1
+
+    def fields(self, pictures: Iterable[Picture], mode: str) -> Iterator[Picture]:
+        yield from pictures
+
+    def late_warnings(self, n_decoded: int) -> list[str]:
+        found = [f"{self.n_failed} images could not be read"] if self.n_failed else []
+        if self._other_size:
+            names = ", ".join(self._other_size[:3])
+            found.append(f"{len(self._other_size)} images of another size were left out ({names})")
+        return found
+
+
+def _open(path: Path) -> Any:
+    try:
+        # 'file:' so that a name with a colon is not taken for a protocol, and nothing but files is opened.
+        only_files = {"protocol_whitelist": "file"}
+        container = av.open(f"file:{path}", metadata_errors="replace", container_options=only_files)
+    except FileNotFoundError:
+        raise InputError(path, "no such file", "check the path") from None
+    except PermissionError:
+        raise InputError(path, "may not be read", "change its permissions") from None
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        cause, cure = _why_unreadable(path, error)
+        raise InputError(path, cause, cure) from None
+    name = container.format.name
+    if TEXT_FORMATS & set(name.split(",")):
+        container.close()
+        raise InputError(path, "is not a video but text", "give the video file itself")
+    if INDIRECT_FORMATS & set(name.split(",")):
+        container.close()
+        raise InputError(path, f"is a list of other files ({name}), not a clip", "give the clip itself")
+    return container
+
+
+def _video_stream(container: Any, path: Path) -> Any:
+    for stream in container.streams.video:
+        cover = "attached_pic" in str(getattr(stream, "disposition", "")).lower()
+        if not cover:
+            if stream.codec_context is None:
+                raise InputError(path, "its video codec is not in this FFmpeg", "convert it to H.264 first")
+            return stream
+    kinds = sorted({s.type for s in container.streams if s.type}) or ["nothing"]
+    raise InputError(path, f"has no video stream (only {', '.join(kinds)})", "give a file with moving pictures")
+
+
+def _refuse_size(path: Path, width: int, height: int, options: DecodeOptions) -> None:
+    if max(width, height) > options.max_side_px:
+        cause = f"declares {width}x{height} px, more than {options.max_side_px} a side"
+        raise InputError(path, cause, "raise decode.max_side_px if that is true")
+
+
+def _why_unreadable(path: Path, error: Exception) -> tuple[str, str]:
+    """Cause and cure of a file that FFmpeg does not open."""
+    size = path.stat().st_size
+    if size == 0:
+        return "the file is empty", "copy it again"
+    with path.open("rb") as stream:
+        boxes = _mp4_boxes(stream, size)
+        stream.seek(0)
+        head = stream.read(512)
+    if boxes and "moov" not in boxes:
+        return "truncated: its index (the moov box) is missing", "copy it again, or repair it from a complete copy"
+    if boxes:
+        return f"damaged beyond reading ({error})", "copy it again"
+    if all(byte in b"\t\n\r\f" or 32 <= byte < 127 or byte >= 128 for byte in head):
+        return "is not a video but text", "give the video file itself"
+    return "is not a video that FFmpeg can read", "check that it plays elsewhere; it may be damaged"
+
+
+def _mp4_boxes(stream: Any, size: int) -> list[str]:
+    """Names of the top-level boxes of an mp4 or mov file; empty when it is none."""
+    names: list[str] = []
+    position = 0
+    while position + 8 <= size and len(names) < 1000:
+        stream.seek(position)
+        length, kind = struct.unpack(">I4s", stream.read(8))
+        if not kind.isalnum() or (not names and kind not in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")):
+            break
+        names.append(kind.decode("ascii"))
+        if length == 1:
+            length = struct.unpack(">Q", stream.read(8).ljust(8, b"\0"))[0]
+        if length < 8:
+            break
+        position += length
+    return names
+
+
+def _rate(stream: Any) -> float:
+    """Frames/s by the header; NaN when it gives none that can be true."""
+    for rate in (stream.average_rate, stream.guessed_rate, stream.base_rate):
+        if rate and 0.1 <= float(rate) <= 1000:
+            return float(rate)
+    return math.nan
+
+
+def _duration(container: Any, stream: Any) -> float:
+    if stream.duration is not None and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    return container.duration / av.time_base if container.duration is not None else math.nan
