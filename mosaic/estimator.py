@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic import kernel_numba as kernel
+from mosaic import kernels
 from mosaic.coords import anchor_information, default_anchors, fit_homography_to_flow
 from mosaic.photometric import estimate_gain
 from mosaic.pyramid import Pyramid
@@ -45,6 +45,7 @@ class RegisterOptions:
     cell_max_px: float = 1.0
     cell_linear_px: float = 4.0
     correlation: float = 4.0
+    kernel: kernels.KernelName = "numba"
 
 
 @dataclass(slots=True)
@@ -59,7 +60,7 @@ class _Linearised:
     n_valid: int
 
 
-def register(
+def align(
     source: PreparedTemplate,
     target: Pyramid,
     start: Any,
@@ -83,7 +84,7 @@ def register(
     gain, offset = 1.0, 0.0
     n_steps = 0
     for index in levels:
-        gain, offset = _gain(source, target, state, masks)
+        gain, offset = _gain(source, target, state, masks, options)
         coarsest = index == levels[0] and len(levels) > 1 and index >= 2
         result = _align_level(source, target, index, state, gain, offset, masks, not coarsest, options)
         if result is None:
@@ -96,7 +97,8 @@ def register(
     return _judge(source, target, finest, state, fine, gain, offset, masks, n_steps, dst, route, options), state
 
 
-def _gain(source: PreparedTemplate, target: Pyramid, state: Any, masks: tuple[Any, ...]) -> tuple[float, float]:
+def _gain(source: PreparedTemplate, target: Pyramid, state: Any, masks: tuple[Any, ...], options: RegisterOptions) -> tuple[float, float]:
+    kernel = kernels.load(options.kernel)
     template = source.template
     where, _, _ = source.family.warp(state, source.prepared_wide)
     index = min(template.wide_level, len(target.levels) - 1)
@@ -105,7 +107,14 @@ def _gain(source: PreparedTemplate, target: Pyramid, state: Any, masks: tuple[An
 
 
 def _evaluate(
-    source: PreparedTemplate, target: Pyramid, index: int, state: Any, gain: float, offset: float, masks: tuple[Any, ...]
+    source: PreparedTemplate,
+    target: Pyramid,
+    index: int,
+    state: Any,
+    gain: float,
+    offset: float,
+    masks: tuple[Any, ...],
+    kernel: Any,
 ) -> _Linearised:
     level = source.template.levels[index]
     assert level is not None  # the caller chose a built level
@@ -136,7 +145,8 @@ def _align_level(
     """Steps on one level; None without texture. Accepts a step only if the robust scale does not grow."""
     if source.template.levels[index] is None or len(source.template.levels[index].src_px) < options.min_pixels:  # type: ignore[union-attr]
         return None
-    now = _evaluate(source, target, index, state, gain, offset, masks)
+    kernel = kernels.load(options.kernel)
+    now = _evaluate(source, target, index, state, gain, offset, masks, kernel)
     steps = 0
     damping = 0.0
     for _ in range(options.max_steps[min(index, len(options.max_steps) - 1)]):
@@ -150,7 +160,7 @@ def _align_level(
             now.scale = float("nan")
             return state, steps, now
         trial_state = source.family.update(state, step)
-        trial = _evaluate(source, target, index, trial_state, gain, offset, masks)
+        trial = _evaluate(source, target, index, trial_state, gain, offset, masks, kernel)
         steps += 1
         # The median residual is the merit: unlike a robust cost it does not change meaning with its own scale.
         if trial.n_valid < 0.7 * now.n_valid or not trial.scale <= 1.05 * now.scale:
@@ -187,7 +197,8 @@ def _judge(
     overlap = fine.n_valid / max(n, 1)
     if fine.n_valid < options.min_pixels or overlap < options.min_overlap:
         return _failed(template.frame, dst, template.size_px, "low_overlap", route, n_steps)
-    score = _score(target, index, fine, level.values, gain, offset, masks)
+    kernel = kernels.load(options.kernel)
+    score = _score(target, index, fine, level.values, gain, offset, masks, kernel)
     weight = kernel.robust_weights(fine.residual, np.float32(fine.scale), True)
     # Inliers against a fixed bound too: a scale that has grown to swallow everything must not pass.
     inliers = float((weight > 0.1).sum()) / fine.n_valid
@@ -199,7 +210,7 @@ def _judge(
         return _failed(template.frame, dst, template.size_px, "few_inliers", route, n_steps, score=score)
     if score > options.score_ok:
         status, reason = PairStatus.WEAK, "score"
-    flow = _flow_grid(fine, weight, level.src_px, level.cell, options)
+    flow = _flow_grid(fine, weight, level.src_px, level.cell, options, kernel)
     if len(flow.cell) < 6:
         return _failed(template.frame, dst, template.size_px, "no_texture", route, n_steps, score=score)
     H, info9 = fit_homography_to_flow(flow.src_px, flow.dst_px, flow.info, _state_homography(source, state))
@@ -245,6 +256,7 @@ def _score(
     gain: float,
     offset: float,
     masks: tuple[Any, ...],
+    kernel: Any,
 ) -> float:
     """Median residual over the median residual of the same pair shifted by a dozen pixels (the null)."""
     stride = max(1, len(values) // 1500)
@@ -263,7 +275,7 @@ def _score(
 
 
 def _flow_grid(
-    fine: _Linearised, weight: NDArray[np.float32], src: FloatArray, cell: NDArray[np.int64], options: RegisterOptions
+    fine: _Linearised, weight: NDArray[np.float32], src: FloatArray, cell: NDArray[np.int64], options: RegisterOptions, kernel: Any
 ) -> FlowGrid:
     """Residual flow per cell with its anisotropic information (real-footage.md 6.3)."""
     A, b, S, counts = kernel.accumulate_cells(fine.residual, fine.G, weight, src, fine.dst, cell, N_CELLS)

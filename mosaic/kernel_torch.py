@@ -1,0 +1,135 @@
+"""The torch / kornia kernel: the same functions as `kernel_numba`, as the readable reference and for other devices.
+
+Takes and gives numpy arrays, so that the estimator is written once; the arithmetic is torch in float64.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from kornia.filters import spatial_gradient
+from numpy.typing import NDArray
+from torch.nn.functional import grid_sample
+
+FloatArray = NDArray[np.float64]
+
+
+def _image(level: NDArray[np.generic]) -> torch.Tensor:
+    return torch.from_numpy(np.asarray(level, np.float64))[None, None]
+
+
+def _at_level(dst: torch.Tensor, sx: float, sy: float) -> tuple[torch.Tensor, torch.Tensor]:
+    return (dst[:, 0] - 0.5 * (sx - 1.0)) / sx, (dst[:, 1] - 0.5 * (sy - 1.0)) / sy
+
+
+def _bilinear(stack: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Channels (c, n) of stack (1, c, h, w) at level pixels; align_corners: pixel 0 is -1, pixel w - 1 is +1."""
+    h, w = stack.shape[-2:]
+    grid = torch.stack([2.0 * x / (w - 1) - 1.0, 2.0 * y / (h - 1) - 1.0], dim=-1)[None, None]
+    return grid_sample(stack, grid, mode="bilinear", padding_mode="zeros", align_corners=True)[0, :, 0]
+
+
+def _usable(dst: torch.Tensor, mask: NDArray[np.uint8], sx: float, sy: float, use_mask: bool) -> torch.Tensor:
+    if not use_mask:
+        return torch.ones(len(dst), dtype=torch.bool)
+    m = torch.from_numpy(mask > 0)
+    finite = torch.nan_to_num(dst, nan=0.0)
+    x = ((finite[:, 0] + 0.5) / sx).long().clamp(0, m.shape[1] - 1)
+    y = ((finite[:, 1] + 0.5) / sy).long().clamp(0, m.shape[0] - 1)
+    return m[y, x]
+
+
+def _inside(x: torch.Tensor, y: torch.Tensor, level: NDArray[np.generic], margin: int) -> torch.Tensor:
+    h, w = level.shape
+    return (x >= margin) & (y >= margin) & (x < w - margin - 1) & (y < h - margin - 1)
+
+
+def sample(
+    level: NDArray[np.generic], sx: float, sy: float, dst: FloatArray, *masks: Any
+) -> NDArray[np.float32]:
+    """See kernel_numba.sample."""
+    points = torch.from_numpy(dst)
+    x, y = _at_level(points, sx, sy)
+    good = _inside(x, y, level, 1) & _usable(points, *masks)
+    values = _bilinear(_image(level), torch.nan_to_num(x), torch.nan_to_num(y))[0]
+    return torch.where(good, values, torch.nan).numpy().astype(np.float32)
+
+
+def linearise(
+    level: NDArray[np.generic],
+    sx: float,
+    sy: float,
+    dst: FloatArray,
+    A: FloatArray,
+    values: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+    gain: float,
+    offset: float,
+    *masks: Any,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """See kernel_numba.linearise: residuals (n,) and ESM gradients (n, 2)."""
+    points = torch.from_numpy(dst)
+    x, y = _at_level(points, sx, sy)
+    derivative = torch.from_numpy(A)
+    det = torch.linalg.det(derivative)
+    good = _inside(x, y, level, 2) & _usable(points, *masks) & (det.abs() >= 1e-12)
+    image = _image(level)
+    stack = torch.cat([image, spatial_gradient(image, mode="diff", normalized=False)[:, 0] * 0.5], dim=1)
+    seen, gx, gy = _bilinear(stack, torch.nan_to_num(x), torch.nan_to_num(y))
+    template = torch.from_numpy(gradients.astype(np.float64))
+    safe = torch.where(good[:, None, None], derivative, torch.eye(2, dtype=torch.float64))
+    carried = torch.linalg.solve(safe.transpose(1, 2), template[:, :, None])[:, :, 0]
+    target = gain * torch.stack([gx / sx, gy / sy], dim=1)
+    G = torch.where(good[:, None], 0.5 * (target + carried), 0.0)
+    residual = torch.from_numpy(values.astype(np.float64)) - (gain * seen + offset)
+    return torch.where(good, residual, torch.nan).numpy().astype(np.float32), G.numpy().astype(np.float32)
+
+
+def robust_weights(residual: NDArray[np.float32], scale: float, tukey: bool) -> NDArray[np.float32]:
+    """See kernel_numba.robust_weights."""
+    r = torch.from_numpy(residual).abs()
+    c = (4.685 if tukey else 1.345) * float(scale)
+    weight = (1.0 - (r / c) ** 2).clamp(min=0.0) ** 2 if tukey else torch.where(r <= c, 1.0, c / r)
+    return torch.nan_to_num(weight, nan=0.0).numpy().astype(np.float32)
+
+
+def accumulate(
+    residual: NDArray[np.float32], G: NDArray[np.float32], J: NDArray[np.float32], weight: NDArray[np.float32]
+) -> tuple[FloatArray, FloatArray, float]:
+    """See kernel_numba.accumulate: N (p, p), b (p,), cost."""
+    w = torch.from_numpy(weight.astype(np.float64))
+    r = torch.nan_to_num(torch.from_numpy(residual.astype(np.float64)))
+    rows = torch.einsum("nk,nkp->np", torch.from_numpy(G.astype(np.float64)), torch.from_numpy(J.astype(np.float64)))
+    rows = torch.nan_to_num(rows)
+    weighted = rows * w[:, None]
+    return (rows.T @ weighted).numpy(), (weighted.T @ r).numpy(), float((w * r * r).sum())
+
+
+def accumulate_cells(
+    residual: NDArray[np.float32],
+    G: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    src: FloatArray,
+    dst: FloatArray,
+    cell: NDArray[np.int64],
+    n_cells: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """See kernel_numba.accumulate_cells: A (c, 2, 2), b (c, 2), S (c, 5), counts (c, 2)."""
+    finite = np.isfinite(residual)
+    index = torch.from_numpy(cell[finite])
+    g = torch.from_numpy(G[finite].astype(np.float64))
+    w = torch.from_numpy(weight[finite].astype(np.float64))
+    r = torch.from_numpy(residual[finite].astype(np.float64))
+    texture = w * (g * g).sum(dim=1)
+    places = torch.from_numpy(np.concatenate([src[finite], dst[finite]], axis=1))
+
+    def summed(rows: torch.Tensor) -> FloatArray:
+        return torch.zeros((n_cells, *rows.shape[1:]), dtype=torch.float64).index_add_(0, index, rows).numpy()
+
+    A = summed(w[:, None, None] * g[:, :, None] * g[:, None, :])
+    b = summed(w[:, None] * g * r[:, None])
+    S = summed(torch.cat([texture[:, None], texture[:, None] * places], dim=1))
+    counts = summed(torch.stack([torch.ones_like(w), (w > 0.3).double()], dim=1))
+    return A, b, S, counts
