@@ -26,82 +26,191 @@ class Section(BaseModel):
 class DecodeOptions(Section):
     """How a file becomes pictures."""
 
-    threads: int = Field(default=0, ge=0, le=64, description=(
-        "decoder threads; 0 = one on up to two cores (measured fastest there: 98 against 70 "
-        "frames/s), else min(4, cores)"))
-    queue_frames: int = Field(default=4, ge=1, le=64, description=(
-        "pictures decoded ahead; 4 hide the decoder's jitter and hold 8 MB at 1080p"))
-    deinterlace: Literal["field", "frame", "off"] = Field(default="field", description=(
-        "interlaced sources: one picture a field (the camera moves between fields), one a frame, "
-        "or leave combed"))
-    pixel_aspect: float | None = Field(default=None, gt=0.1, lt=10, description=(
-        "width over height of a pixel; none = what the file says (many SD files say nothing)"))
-    image_fps: float = Field(default=25.0, gt=0, le=10000, description=(
-        "pictures/s given to image sequences, which carry no time; 25 is only a convention"))
-    max_side_px: int = Field(default=16384, ge=16, le=65536, description=(
-        "px; a larger declared width or height is refused before memory is asked for: no camera makes one"))
-    accept_zero_timecode: bool = Field(default=False, description=(
-        "take 00:00:00:00 at the start as real; MXF and MPEG-2 write it when nobody set one, so false"))
+    threads: int = Field(
+        default=0,
+        ge=0,
+        le=64,
+        description=(
+            "decoder threads; 0 = one on up to two cores (measured fastest there: 98 against 70 "
+            "frames/s), else min(4, cores)"
+        ),
+    )
+    queue_frames: int = Field(
+        default=4,
+        ge=1,
+        le=64,
+        description=("pictures decoded ahead; 4 hide the decoder's jitter and hold 8 MB at 1080p"),
+    )
+    deinterlace: Literal["field", "frame", "off"] = Field(
+        default="field",
+        description=(
+            "interlaced sources: one picture a field (the camera moves between fields), one a frame, "
+            "or leave combed"
+        ),
+    )
+    pixel_aspect: float | None = Field(
+        default=None,
+        gt=0.1,
+        lt=10,
+        description=("width over height of a pixel; none = what the file says (many SD files say nothing)"),
+    )
+    image_fps: float = Field(
+        default=25.0,
+        gt=0,
+        le=10000,
+        description=("pictures/s given to image sequences, which carry no time; 25 is only a convention"),
+    )
+    max_side_px: int = Field(
+        default=16384,
+        ge=16,
+        le=65536,
+        description=(
+            "px; a larger declared width or height is refused before memory is asked for: no camera makes one"
+        ),
+    )
+    accept_zero_timecode: bool = Field(
+        default=False,
+        description=(
+            "take 00:00:00:00 at the start as real; MXF and MPEG-2 write it when nobody set one, so false"
+        ),
+    )
 
 
 class OverlayOptions(Section):
     """How graphics that are fixed on the screen (scoreboard, logo, letterbox) are found."""
 
-    enabled: bool = Field(default=True, description=(
-        "look for fixed graphics and keep them out of registration"))
-    sample_motion: float = Field(default=0.05, gt=0, le=1, description=(
-        "widths of the frame that the camera moves between two samples; when it rests everything "
-        "looks fixed"))
-    min_samples: int = Field(default=12, ge=3, description=(
-        "samples before anything is masked; with fewer, flat grass passes for fixed"))
-    max_std_grey: float = Field(default=8.0, gt=0, le=128, description=(
-        "grey levels; temporal deviation below which a pixel is fixed (half-transparent logos let "
-        "some scene through)"))
-    min_gradient_grey: float = Field(default=6.0, gt=0, le=255, description=(
-        "grey levels per quarter-size px; edge strength of the mean picture that seeds a graphic: "
-        "moving scenes average out"))
-    dilate_px: int = Field(default=3, ge=0, le=64, description=(
-        "px of the full frame added around a graphic: coding noise and anti-aliasing spread that far"))
+    enabled: bool = Field(
+        default=True, description=("look for fixed graphics and keep them out of registration")
+    )
+    sample_motion: float = Field(
+        default=0.05,
+        gt=0,
+        le=1,
+        description=(
+            "widths of the frame that the camera moves between two samples; when it rests everything "
+            "looks fixed"
+        ),
+    )
+    min_samples: int = Field(
+        default=12,
+        ge=3,
+        description=("samples before anything is masked; with fewer, flat grass passes for fixed"),
+    )
+    max_std_grey: float = Field(
+        default=8.0,
+        gt=0,
+        le=128,
+        description=(
+            "grey levels; temporal deviation below which a pixel is fixed (half-transparent logos let "
+            "some scene through)"
+        ),
+    )
+    min_gradient_grey: float = Field(
+        default=6.0,
+        gt=0,
+        le=255,
+        description=(
+            "grey levels per quarter-size px; edge strength of the mean picture that seeds a graphic: "
+            "moving scenes average out"
+        ),
+    )
+    dilate_px: int = Field(
+        default=3,
+        ge=0,
+        le=64,
+        description=(
+            "px of the full frame added around a graphic: coding noise and anti-aliasing spread that far"
+        ),
+    )
 
 
 class RegistrationOptions(Section):
     """Direct alignment of two frames."""
 
-    n_fine: int = Field(default=6000, ge=200, description=(
-        "pixels aligned at full size, best gradient per cell; 13,000 gain 1/6 of the error for 1/3 "
-        "more time"))
-    n_half: int = Field(default=3400, ge=100, description=(
-        "pixels aligned at half size, where the codec's noise is lower"))
-    levels: int = Field(default=4, ge=2, le=8, description=(
-        "pyramid levels; 4 hold about 21 px of motion at 1080p from a standing start, 5 hold 32"))
-    kernel: Literal["numba", "torch"] = Field(default="numba", description=(
-        "numba is three times faster on a CPU; torch is the reference and runs on a GPU"))
-    keyframe_shift: float = Field(default=0.15, gt=0, lt=1, description=(
-        "widths of the frame moved before a new keyframe: half a step more and lens and parallax "
-        "errors lose the lock"))
-    keyframe_zoom: float = Field(default=1.15, gt=1, lt=4, description=(
-        "zoom ratio to the keyframe before a new one is taken"))
-    min_overlap: float = Field(default=0.4, gt=0, lt=1, description=(
-        "share of the frame seen in both; below it a pair is refused"))
+    n_fine: int = Field(
+        default=6000,
+        ge=200,
+        description=(
+            "pixels aligned at full size, best gradient per cell; 13,000 gain 1/6 of the error for 1/3 "
+            "more time"
+        ),
+    )
+    n_half: int = Field(
+        default=3400, ge=100, description=("pixels aligned at half size, where the codec's noise is lower")
+    )
+    levels: int = Field(
+        default=4,
+        ge=2,
+        le=8,
+        description=(
+            "pyramid levels; 4 hold about 21 px of motion at 1080p from a standing start, 5 hold 32"
+        ),
+    )
+    kernel: Literal["numba", "torch"] = Field(
+        default="numba",
+        description=("numba is three times faster on a CPU; torch is the reference and runs on a GPU"),
+    )
+    keyframe_shift: float = Field(
+        default=0.15,
+        gt=0,
+        lt=1,
+        description=(
+            "widths of the frame moved before a new keyframe: half a step more and lens and parallax "
+            "errors lose the lock"
+        ),
+    )
+    keyframe_zoom: float = Field(
+        default=1.15, gt=1, lt=4, description=("zoom ratio to the keyframe before a new one is taken")
+    )
+    min_overlap: float = Field(
+        default=0.4, gt=0, lt=1, description=("share of the frame seen in both; below it a pair is refused")
+    )
 
 
 class CalibrationOptions(Section):
     """What is known of the camera beforehand, and what is estimated."""
 
-    focal_px: float | None = Field(default=None, gt=0, description=(
-        "px of the frame as decoded: a focal length known from elsewhere; none = self-calibrated"))
-    focal_frame: int | None = Field(default=None, ge=0, description=(
-        "picture at which focal_px holds; none = the reference frame of each shot"))
-    focal_std_px: float | None = Field(default=None, gt=0, description=(
-        "px; one-sigma error of focal_px; none = 2 % of it, about what a lens scale or a pitch fit gives"))
-    fix_pp: bool = Field(default=False, description=(
-        "hold the principal point at the middle of the frame; free, it soaks up some parallax (25 "
-        "px prior at 1280)"))
-    distortion: bool = Field(default=True, description=(
-        "estimate radial distortion as a function of zoom; without it real broadcast focals come "
-        "out 40 % short"))
-    sensor_width_mm: float | None = Field(default=None, gt=0, le=100, description=(
-        "mm; only for exports that speak millimetres; none = those say that the scale is nominal"))
+    focal_px: float | None = Field(
+        default=None,
+        gt=0,
+        description=(
+            "px of the frame as decoded: a focal length known from elsewhere; none = self-calibrated"
+        ),
+    )
+    focal_frame: int | None = Field(
+        default=None,
+        ge=0,
+        description=("picture at which focal_px holds; none = the reference frame of each shot"),
+    )
+    focal_std_px: float | None = Field(
+        default=None,
+        gt=0,
+        description=(
+            "px; one-sigma error of focal_px; none = 2 % of it, about what a lens scale or a pitch fit gives"
+        ),
+    )
+    fix_pp: bool = Field(
+        default=False,
+        description=(
+            "hold the principal point at the middle of the frame; free, it soaks up some parallax (25 "
+            "px prior at 1280)"
+        ),
+    )
+    distortion: bool = Field(
+        default=True,
+        description=(
+            "estimate radial distortion as a function of zoom; without it real broadcast focals come "
+            "out 40 % short"
+        ),
+    )
+    sensor_width_mm: float | None = Field(
+        default=None,
+        gt=0,
+        le=100,
+        description=(
+            "mm; only for exports that speak millimetres; none = those say that the scale is nominal"
+        ),
+    )
 
     @model_validator(mode="after")
     def _focal_comes_first(self) -> Self:
@@ -113,12 +222,23 @@ class CalibrationOptions(Section):
 class ShotOptions(Section):
     """Where one view of the main camera ends."""
 
-    bridge_frames: int = Field(default=10, ge=1, le=250, description=(
-        "pictures that a failed registration may span and still be one shot (flash, dropped "
-        "frame); cuts never recover"))
-    min_frames: int = Field(default=10, ge=2, description=(
-        "pictures; a shorter run is no shot: too little motion to calibrate and mostly the middle "
-        "of a transition"))
+    bridge_frames: int = Field(
+        default=10,
+        ge=1,
+        le=250,
+        description=(
+            "pictures that a failed registration may span and still be one shot (flash, dropped "
+            "frame); cuts never recover"
+        ),
+    )
+    min_frames: int = Field(
+        default=10,
+        ge=2,
+        description=(
+            "pictures; a shorter run is no shot: too little motion to calibrate and mostly the middle "
+            "of a transition"
+        ),
+    )
 
 
 class PanoramaOptions(Section):
@@ -126,34 +246,55 @@ class PanoramaOptions(Section):
 
     enabled: bool = Field(default=True, description="make the panorama; it takes a second pass over the clip")
     projection: Literal["auto", "equirectangular", "cylindrical", "planar"] = Field(
-        default="auto", description=(
-        "auto = planar below about 60 degrees of view, cylindrical beyond, equirectangular when it "
-        "also tilts far"))
-    max_megapixels: float = Field(default=60.0, gt=0.01, le=4000, description=(
-        "megapixels; larger scenes are scaled down; memory and time follow it"))
-    views: int = Field(default=17, ge=3, le=99, description=(
-        "frames whose median makes a pixel; 15 are as good as 50, odd keeps the median a real sample"))
+        default="auto",
+        description=(
+            "auto = planar below about 60 degrees of view, cylindrical beyond, equirectangular when it "
+            "also tilts far"
+        ),
+    )
+    max_megapixels: float = Field(
+        default=60.0,
+        gt=0.01,
+        le=4000,
+        description=("megapixels; larger scenes are scaled down; memory and time follow it"),
+    )
+    views: int = Field(
+        default=17,
+        ge=3,
+        le=99,
+        description=(
+            "frames whose median makes a pixel; 15 are as good as 50, odd keeps the median a real sample"
+        ),
+    )
 
 
 class OutputOptions(Section):
     """What is written beside the always-written files."""
 
-    parquet: bool = Field(default=False, description=(
-        "camera.parquet too; needs the extra [parquet] (pyarrow, 170 MB)"))
-    jpeg_max_width: int = Field(default=16384, ge=64, le=65500, description=(
-        "px; widest panorama.jpg: many viewers stop at 16384, the format itself at 65500"))
+    parquet: bool = Field(
+        default=False, description=("camera.parquet too; needs the extra [parquet] (pyarrow, 170 MB)")
+    )
+    jpeg_max_width: int = Field(
+        default=16384,
+        ge=64,
+        le=65500,
+        description=("px; widest panorama.jpg: many viewers stop at 16384, the format itself at 65500"),
+    )
 
 
 class RunOptions(Section):
     """The run itself; nothing here changes a result except the range of pictures."""
 
-    threads: int = Field(default=0, ge=0, le=256, description=(
-        "threads of the numeric kernels; 0 = as many as cores"))
-    resume: bool = Field(default=False, description=(
-        "keep the shots that an interrupted run in the same folder finished"))
+    threads: int = Field(
+        default=0, ge=0, le=256, description=("threads of the numeric kernels; 0 = as many as cores")
+    )
+    resume: bool = Field(
+        default=False, description=("keep the shots that an interrupted run in the same folder finished")
+    )
     start_frame: int = Field(default=0, ge=0, description="first output picture that is used; counted from 0")
-    max_frames: int | None = Field(default=None, ge=2, description=(
-        "pictures used from there; none = to the end"))
+    max_frames: int | None = Field(
+        default=None, ge=2, description=("pictures used from there; none = to the end")
+    )
 
 
 class Config(Section):
@@ -218,7 +359,9 @@ def parse_overrides(args: Iterable[str]) -> dict[str, str]:
         name, equals, value = word[2:].partition("=")
         name = name.replace("-", "_")
         if name not in option_names():
-            raise ConfigError(word, "unknown option", _nearest(f"--{name}", [f"--{n}" for n in option_names()]))
+            raise ConfigError(
+                word, "unknown option", _nearest(f"--{name}", [f"--{n}" for n in option_names()])
+            )
         if not equals:
             if not rest or (rest[0].startswith("--") and rest[0][2:3].isalpha()):
                 raise ConfigError(word, "has no value", f"write {word} VALUE")
@@ -272,7 +415,9 @@ def _read(path: Path) -> dict[str, Any]:
     except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
         raise ConfigError(path, f"not valid ({error})", "mend that line") from None
     if not isinstance(data, dict) or not isinstance(data.get("config"), dict):
-        raise ConfigError(path, "holds no configuration", "give a run.json written by broadcast-mosaic, or a TOML file")
+        raise ConfigError(
+            path, "holds no configuration", "give a run.json written by broadcast-mosaic, or a TOML file"
+        )
     return dict(data["config"])
 
 

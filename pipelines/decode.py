@@ -183,7 +183,9 @@ def open_clip(path: str | Path, options: DecodeOptions | None = None) -> Clip:
     with open_source(path, options) as source:
         first = next(source.pictures(), None)
         if first is None:
-            raise InputError(path, "no picture could be decoded", "it is damaged, or its codec is not in this FFmpeg")
+            raise InputError(
+                path, "no picture could be decoded", "it is damaged, or its codec is not in this FFmpeg"
+            )
         return Clip(_facts(source, first, options), options)
 
 
@@ -195,7 +197,9 @@ def _facts(source: Source, first: Picture, options: DecodeOptions) -> ClipFacts:
     # The picture's own flag decides: stream headers call plenty of progressive material interlaced.
     interlaced = bool(video.interlaced_frame)
     if source.says_interlaced and not interlaced:
-        warnings.append("the stream calls itself interlaced, its first picture is not: each is judged by itself")
+        warnings.append(
+            "the stream calls itself interlaced, its first picture is not: each is judged by itself"
+        )
     mode = "none" if not interlaced or options.deinterlace == "off" else f"bwdif send_{options.deinterlace}"
     if interlaced:
         how = {"off": "left combed", "field": "one picture a field", "frame": "one picture a frame"}
@@ -244,18 +248,32 @@ def _gray(video: av.VideoFrame, turns: int) -> NDArray[Any]:
     """(h, w) luma of a picture, turned upright, owned and read-only: uint8, or float32 0..255 above 8 bits."""
     name = video.format.name
     bits = video.format.components[0].bits
-    if not name.startswith(("yuv4", "yuvj4", "yuva4", "gray", "nv12", "nv21", "nv16")) or name.startswith("grayf"):
+    if not name.startswith(("yuv4", "yuvj4", "yuva4", "gray", "nv12", "nv21", "nv16")) or name.startswith(
+        "grayf"
+    ):
         # RGB, packed and shifted layouts: one conversion to a plain plane; of 16 bits, because 10-bit to 8 dithers.
-        packed_yuv = not video.format.is_rgb and not video.format.has_palette and len(video.format.components) > 2
-        plain = ("yuv422p" if packed_yuv else "gray") if bits <= 8 else ("yuv444p16le" if packed_yuv else "gray16le")
+        packed_yuv = (
+            not video.format.is_rgb and not video.format.has_palette and len(video.format.components) > 2
+        )
+        plain = (
+            ("yuv422p" if packed_yuv else "gray")
+            if bits <= 8
+            else ("yuv444p16le" if packed_yuv else "gray16le")
+        )
         video = video.reformat(format=plain)
         name, bits = plain, (8 if bits <= 8 else 16)
     plane: Any = video.planes[0]  # has the buffer protocol
-    sample: np.dtype[Any] = np.dtype(np.uint8) if bits <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
+    sample: np.dtype[Any] = (
+        np.dtype(np.uint8) if bits <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
+    )
     padded = np.frombuffer(plane, sample).reshape(plane.height, plane.line_size // sample.itemsize)
     view = np.rot90(padded[:, : video.width], turns)
     # The copy detaches the picture from the decoder's pool, so that keeping a frame costs 2 MB, not a pool.
-    gray = np.array(view, np.uint8, order="C") if bits <= 8 else view.astype(np.float32) / np.float32(1 << (bits - 8))
+    gray = (
+        np.array(view, np.uint8, order="C")
+        if bits <= 8
+        else view.astype(np.float32) / np.float32(1 << (bits - 8))
+    )
     gray = np.ascontiguousarray(gray)
     gray.setflags(write=False)
     return gray
@@ -273,8 +291,15 @@ def _rgb(video: av.VideoFrame, turns: int) -> NDArray[np.uint8]:
 def _matrix(video: av.VideoFrame) -> Colorspace:
     """The YCbCr matrix: as tagged; untagged, BT.709 from 720 lines up (FFmpeg would take BT.601: red turns orange)."""
     tagged = int(video.colorspace)
-    known = {1: Colorspace.ITU709, 4: Colorspace.FCC, 5: Colorspace.ITU601, 6: Colorspace.ITU601,
-             7: Colorspace.SMPTE240M, 9: Colorspace.BT2020, 10: Colorspace.BT2020}
+    known = {
+        1: Colorspace.ITU709,
+        4: Colorspace.FCC,
+        5: Colorspace.ITU601,
+        6: Colorspace.ITU601,
+        7: Colorspace.SMPTE240M,
+        9: Colorspace.BT2020,
+        10: Colorspace.BT2020,
+    }
     return known.get(tagged, Colorspace.ITU709 if video.height >= 720 else Colorspace.ITU601)
 
 
@@ -419,10 +444,16 @@ def _frames(
         counts["repaired_pts"] = repair.n_repaired
         counts["gaps"] = repair.n_gaps
         if complete and counts["decoded"] < 2:
-            raise InputError(facts.path, "only one picture could be decoded", "a clip needs at least two frames")
+            raise InputError(
+                facts.path, "only one picture could be decoded", "a clip needs at least two frames"
+            )
         if complete and counts["pictures"] <= first:
-            raise InputError(facts.path, f"has only {counts['pictures']} pictures", f"start before picture {first}")
+            raise InputError(
+                facts.path, f"has only {counts['pictures']} pictures", f"start before picture {first}"
+            )
         if complete and 0 < counts["fields"] < counts["pictures"]:
-            warnings.append(f"{counts['fields'] // 2} of {counts['decoded']} frames are interlaced, the others are not")
+            warnings.append(
+                f"{counts['fields'] // 2} of {counts['decoded']} frames are interlaced, the others are not"
+            )
         if complete:
             warnings.extend(source.late_warnings(counts["decoded"]) + repair.warnings())

@@ -20,10 +20,25 @@ from pipelines.errors import InputError
 from pipelines.picture import Picture
 from pipelines.timing import Timecode
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr", ".dpx", ".jp2", ".ppm", ".pgm")
+IMAGE_SUFFIXES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".tif",
+    ".tiff",
+    ".bmp",
+    ".webp",
+    ".exr",
+    ".dpx",
+    ".jp2",
+    ".ppm",
+    ".pgm",
+)
 
 # Formats that are lists of other files or addresses: a hostile "clip" could read what the user did not name.
-INDIRECT_FORMATS = frozenset({"hls", "concat", "dash", "sdp", "rtsp", "rtp", "imf", "lavfi", "webm_dash_manifest"})
+INDIRECT_FORMATS = frozenset(
+    {"hls", "concat", "dash", "sdp", "rtsp", "rtp", "imf", "lavfi", "webm_dash_manifest"}
+)
 
 # FFmpeg plays a text file as a picture of a terminal.
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf"})
@@ -60,7 +75,9 @@ def open_source(path: Path, options: DecodeOptions) -> Source:
         files = list_images(path)
         if not files:
             cause = "no images in it" if path.is_dir() else "no file matches the pattern"
-            raise InputError(path, cause, f"it must hold numbered images ({', '.join(IMAGE_SUFFIXES[:3])} ...)")
+            raise InputError(
+                path, cause, f"it must hold numbered images ({', '.join(IMAGE_SUFFIXES[:3])} ...)"
+            )
         return ImageSource(path, files, options)
     return ContainerSource(path, options)
 
@@ -68,7 +85,9 @@ def open_source(path: Path, options: DecodeOptions) -> Source:
 def list_images(path: Path) -> list[Path]:
     """The images of a folder, or those that match frames/%06d.png, in the order of the numbers in their names."""
     if path.is_dir():
-        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+        found = [
+            p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
+        ]
     else:
         pattern = re.compile(re.sub(r"%0?\d*d", r"\\d+", re.escape(path.name).replace("\\%", "%")))
         parent = path.parent if path.parent.is_dir() else None
@@ -170,7 +189,11 @@ class ContainerSource:
         return found
 
     def _find_timecode(self) -> Timecode | None:
-        for tags in (self._stream.metadata, self._container.metadata, *(s.metadata for s in self._container.streams)):
+        for tags in (
+            self._stream.metadata,
+            self._container.metadata,
+            *(s.metadata for s in self._container.streams),
+        ):
             if "timecode" in tags:
                 found = Timecode.parse(tags["timecode"], self.fps)
                 if found is not None:
@@ -274,7 +297,9 @@ def _video_stream(container: Any, path: Path) -> Any:
                 raise InputError(path, "its video codec is not in this FFmpeg", "convert it to H.264 first")
             return stream
     kinds = sorted({s.type for s in container.streams if s.type}) or ["nothing"]
-    raise InputError(path, f"has no video stream (only {', '.join(kinds)})", "give a file with moving pictures")
+    raise InputError(
+        path, f"has no video stream (only {', '.join(kinds)})", "give a file with moving pictures"
+    )
 
 
 def _refuse_size(path: Path, width: int, height: int, options: DecodeOptions) -> None:
@@ -293,7 +318,10 @@ def _why_unreadable(path: Path, error: Exception) -> tuple[str, str]:
         stream.seek(0)
         head = stream.read(512)
     if boxes and "moov" not in boxes:
-        return "truncated: its index (the moov box) is missing", "copy it again, or repair it from a complete copy"
+        return (
+            "truncated: its index (the moov box) is missing",
+            "copy it again, or repair it from a complete copy",
+        )
     if boxes:
         return f"damaged beyond reading ({error})", "copy it again"
     if all(byte in b"\t\n\r\f" or 32 <= byte < 127 or byte >= 128 for byte in head):
@@ -308,7 +336,9 @@ def _mp4_boxes(stream: Any, size: int) -> list[str]:
     while position + 8 <= size and len(names) < 1000:
         stream.seek(position)
         length, kind = struct.unpack(">I4s", stream.read(8))
-        if not kind.isalnum() or (not names and kind not in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")):
+        if not kind.isalnum() or (
+            not names and kind not in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+        ):
             break
         names.append(kind.decode("ascii"))
         if length == 1:

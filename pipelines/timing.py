@@ -69,7 +69,9 @@ class PtsRepair:
             if time - last > GAP_FRAMES * dt:
                 self.n_gaps += 1
                 self._longest = max(self._longest, (time - last, picture.source_frame))
-        changed = not math.isclose(time, raw + shift, rel_tol=0, abs_tol=1e-9) or (shift != 0 and time - raw == shift)
+        changed = not math.isclose(time, raw + shift, rel_tol=0, abs_tol=1e-9) or (
+            shift != 0 and time - raw == shift
+        )
         if changed or not math.isfinite(raw):
             self.n_repaired += 1
         return time, shift, replace(picture, pts_s=time, frame_start_s=time)
@@ -81,7 +83,9 @@ class PtsRepair:
             found.append(f"{self.n_repaired} time stamps were missing or ran backwards and were repaired")
         if self.n_gaps:
             length, frame = self._longest
-            found.append(f"{self.n_gaps} gaps in the time stamps, the longest {length:.3f} s before frame {frame}")
+            found.append(
+                f"{self.n_gaps} gaps in the time stamps, the longest {length:.3f} s before frame {frame}"
+            )
         return found
 
 

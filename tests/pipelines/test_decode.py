@@ -30,7 +30,9 @@ def test_gray_is_the_stored_luma_and_outlives_the_decoder(tmp_path: Path) -> Non
     assert clip.facts.size_px == (66, 50)
     assert [f.index for f in frames] == list(range(8))
     for i, frame in enumerate(frames):
-        assert frame.gray.dtype == np.uint8 and frame.gray.flags.c_contiguous and not frame.gray.flags.writeable
+        assert (
+            frame.gray.dtype == np.uint8 and frame.gray.flags.c_contiguous and not frame.gray.flags.writeable
+        )
         np.testing.assert_array_equal(frame.gray, ramp(i, (66, 50)))
         assert frame.pts_s == pytest.approx(i / 25, abs=5e-4)  # Matroska counts in ms
         assert frame.field is None and frame.source_frame == i and frame.mask is None
@@ -101,7 +103,9 @@ def test_zero_timecode_means_nobody_set_one(tmp_path: Path) -> None:
 def test_drop_frame_timecode_skips_two_numbers_a_minute_but_not_the_tenth() -> None:
     fps = 30000 / 1001
     for before, after in [
-        ("00:00:59;29", "00:01:00;02"), ("00:09:59;29", "00:10:00;00"), ("23:59:59;29", "00:00:00;00")
+        ("00:00:59;29", "00:01:00;02"),
+        ("00:09:59;29", "00:10:00;00"),
+        ("23:59:59;29", "00:00:00;00"),
     ]:
         start = Timecode.parse(before, fps)
         assert start is not None and str(start) == before
@@ -196,7 +200,11 @@ def bar(shift: float) -> np.ndarray:
 def test_fields_become_pictures_in_order_of_time(tmp_path: Path, top_first: bool) -> None:
     path = interlaced_clip(tmp_path / "a.mkv", 8, top_first)
     clip, frames = decode(path)
-    assert clip.facts.interlaced and clip.facts.deinterlace == "bwdif send_field" and clip.facts.picture_fps == 50
+    assert (
+        clip.facts.interlaced
+        and clip.facts.deinterlace == "bwdif send_field"
+        and clip.facts.picture_fps == 50
+    )
     assert len(frames) == 16 and clip.counts["decoded"] == 8
     assert [(f.source_frame, f.field) for f in frames] == [(i // 2, i % 2) for i in range(16)]
     assert [f.pts_s for f in frames] == pytest.approx([i / 50 for i in range(16)], abs=1e-3)
@@ -302,7 +310,17 @@ def broken_inputs(folder: Path) -> dict[str, tuple[Path, str]]:
 
 
 KINDS = (
-    "missing", "text", "ansi", "truncated", "empty", "noise", "audio", "no images", "no match", "one frame", "indirect"
+    "missing",
+    "text",
+    "ansi",
+    "truncated",
+    "empty",
+    "noise",
+    "audio",
+    "no images",
+    "no match",
+    "one frame",
+    "indirect",
 )
 
 

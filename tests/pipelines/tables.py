@@ -1,0 +1,63 @@
+"""Camera tables and records for the tests of archive, compare and the command line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from pipelines.archive import COLUMNS
+from pipelines.records import CameraTable, RunRecord, ShotRecord
+
+EMPTY = math.nan
+
+
+def camera_table(n: int, **columns: Any) -> CameraTable:
+    """n rows with nothing known, but for `columns`."""
+    texts = {name: ("",) * n for name in ("timecode", "status", "reason")}
+    counts = {
+        "frame": np.arange(n),
+        "source_frame": np.arange(n),
+        "field": np.full(n, -1),
+        "shot": np.zeros(n, int),
+    }
+    plain = {f.name for f in fields(CameraTable)}
+    floats = [name for name, kind, _ in COLUMNS if kind == "float" and name in plain]
+    values: dict[str, Any] = {**texts, **counts, **{name: np.full(n, EMPTY) for name in floats}}
+    values["homography"] = np.full((n, 3, 3), EMPTY)
+    return CameraTable(**{**values, **columns})
+
+
+def shot_record(index: int = 0, **values: Any) -> ShotRecord:
+    """A finished shot of ten frames."""
+    defaults: dict[str, Any] = {
+        "index": index,
+        "first_frame": 10 * index,
+        "last_frame": 10 * index + 9,
+        "reference_frame": 10 * index + 4,
+        "status": "ok",
+        "reason": "",
+        "sentence": "",
+        "focal": {"min_px": 2000.0, "max_px": 2500.5, "min_std_px": 20.0, "max_std_px": 25.25},
+        "calibration": {"s10_px": 0.5, "lens": {"c0": 0.03, "c1": -0.01}},
+        "panorama": None,
+        "files": (),
+        "status_counts": {"ok": 9, "lost": 1},
+        "timings_s": {"register": 1.25},
+        "warnings": ("one thing",),
+    }
+    return ShotRecord(**{**defaults, **values})
+
+
+def run_record(shots: tuple[ShotRecord, ...] = (), **values: Any) -> RunRecord:
+    """A run of those shots."""
+    defaults: dict[str, Any] = {
+        "versions": {"broadcast-mosaic": "0"},
+        "config": {"run": {"resume": False}},
+        "clip": {"path": "clip.mp4", "size_px": [640, 360]},
+        "shots": shots,
+        "timings_s": {"total": 2.5},
+    }
+    return RunRecord(**{**defaults, **values})
