@@ -6,6 +6,7 @@ import csv
 import errno
 import json
 import math
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -32,11 +33,14 @@ from pipelines.records import CameraTable
 from tests.pipelines.tables import camera_table, run_record, shot_record
 
 # As product.md has them.
-PRODUCT_COLUMNS = """
+PRODUCT_COLUMNS = re.findall(
+    r"\w+",
+    """
     frame pts_s timecode source_frame field shot status reason f_px f_std_px f_stat_px zoom_ratio zoom_ratio_std
     hfov_deg pan_deg tilt_deg roll_deg cx_px cy_px aspect k1 residual_px overlap
     h11 h12 h13 h21 h22 h23 h31 h32 h33
-""".split()
+    """,
+)
 
 
 def awkward_table(n: int = 40) -> CameraTable:
