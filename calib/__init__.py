@@ -1,1 +1,33 @@
-"""Homographies to a calibrated camera track: self-calibration of a rotating and zooming camera."""
+"""Homographies to a calibrated camera track: self-calibration of a rotating and zooming camera.
+
+numpy and scipy only; knows no image. refine() calibrates a graph of keyframes, solve_poses() the frames in between,
+judge() says whether the focal length may be published, RunningCalibrator does it while frames arrive.
+"""
+
+from calib.gates import GateOptions, judge
+from calib.records import (
+    HomographyEdge,
+    HomographyGraph,
+    KnownFocal,
+    Lens,
+    Level,
+    Priors,
+    Solution,
+    Verdict,
+)
+from calib.refine import RefineOptions, refine
+
+__all__ = [
+    "GateOptions",
+    "HomographyEdge",
+    "HomographyGraph",
+    "KnownFocal",
+    "Lens",
+    "Level",
+    "Priors",
+    "RefineOptions",
+    "Solution",
+    "Verdict",
+    "judge",
+    "refine",
+]

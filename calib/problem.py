@@ -1,0 +1,280 @@
+"""A graph as arrays, and its robust least-squares linearisation per edge. No solving here.
+
+Everything carries a leading axis of starts, so that a multistart costs one pass. An edge's block is 13 x 13 over
+(log f_a, rot_a, log f_b, rot_b, shared 5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import camera, rotation
+from calib.dlt import square_root_information
+from calib.records import HomographyEdge, HomographyGraph, Priors
+
+Array = NDArray[np.float64]
+CHUNK_POINTS = 60_000  # points linearised at once: keeps the working set of ~100 arrays inside a few tens of MB
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Packed:
+    """Edges as arrays, padded to the longest: ia, ib (E,) frame rows; a_x .. b_y (E, m) raw px; s11, s12, s22 (E, m)
+
+    square root of the information; dof (E, m) directions known better than 1 px (0, 1 or 2); size_px.
+    """
+
+    ia: NDArray[np.int64]
+    ib: NDArray[np.int64]
+    a_x: Array
+    a_y: Array
+    b_x: Array
+    b_y: Array
+    s11: Array
+    s12: Array
+    s22: Array
+    dof: Array
+    H: Array
+    n_frames: int
+    size_px: tuple[int, int]
+
+    @property
+    def n_edges(self) -> int:
+        """Number of edges."""
+        return len(self.ia)
+
+    @property
+    def log_width(self) -> float:
+        """log W."""
+        return float(np.log(self.size_px[0]))
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Packed:
+        """The same frames with some of the edges."""
+        return Packed(
+            ia=self.ia[keep], ib=self.ib[keep], a_x=self.a_x[keep], a_y=self.a_y[keep], b_x=self.b_x[keep],
+            b_y=self.b_y[keep], s11=self.s11[keep], s12=self.s12[keep], s22=self.s22[keep], dof=self.dof[keep],
+            H=self.H[keep], n_frames=self.n_frames, size_px=self.size_px,
+        )  # fmt: skip
+
+    def thin(self, n_points: int) -> Packed:
+        """The same edges with about n_points of their points, well spread: a stride through each edge's known points."""
+        m = self.dof.shape[1]
+        if m <= n_points:
+            return self
+        # Known points first, in their own order; then an even stride through them.
+        order = np.argsort(self.dof <= 0, axis=1, kind="stable")
+        count = np.maximum((self.dof > 0).sum(1), 1)
+        # Golden-ratio phase per edge: not the same columns of the grid in every edge.
+        phase = (np.arange(self.n_edges) * 0.618) % 1.0
+        steps = (np.arange(n_points)[None, :] + phase[:, None]) * np.maximum(count, n_points)[:, None] / n_points
+        pick = np.take_along_axis(order, np.minimum(steps.astype(int), m - 1), 1)
+
+        def take(values: Array) -> Array:
+            return np.take_along_axis(values, pick, 1)
+
+        return Packed(
+            ia=self.ia, ib=self.ib, a_x=take(self.a_x), a_y=take(self.a_y), b_x=take(self.b_x), b_y=take(self.b_y),
+            s11=take(self.s11), s12=take(self.s12), s22=take(self.s22), dof=take(self.dof),
+            H=self.H, n_frames=self.n_frames, size_px=self.size_px,
+        )  # fmt: skip
+
+    def points(self) -> tuple[Array, Array, Array]:
+        """grid_a (E, m, 2), grid_b (E, m, 2), root information (E, m, 2, 2)."""
+        root = np.stack([np.stack([self.s11, self.s12], -1), np.stack([self.s12, self.s22], -1)], -2)
+        return np.stack([self.a_x, self.a_y], -1), np.stack([self.b_x, self.b_y], -1), root
+
+
+def pack(graph: HomographyGraph, edges: Sequence[HomographyEdge] | None = None) -> Packed:
+    """Arrays of a graph's edges (or of the given ones among its frames). Non-finite points carry no information."""
+    edges = graph.edges if edges is None else tuple(edges)
+    rows = {frame: k for k, frame in enumerate(graph.frames.tolist())}
+    m = max((len(e.grid_a) for e in edges), default=1)
+    E = len(edges)
+    grid_a, grid_b, info = np.zeros((E, m, 2)), np.zeros((E, m, 2)), np.zeros((E, m, 2, 2))
+    centre = np.array([(graph.size_px[0] - 1) / 2, (graph.size_px[1] - 1) / 2])
+    grid_a[:], grid_b[:] = centre, centre
+    for k, edge in enumerate(edges):
+        n = len(edge.grid_a)
+        grid_a[k, :n], grid_b[k, :n], info[k, :n] = edge.grid_a, edge.grid_b, edge.info / edge.kappa
+    finite = np.isfinite(grid_a).all(-1) & np.isfinite(grid_b).all(-1) & np.isfinite(info).all((-1, -2))
+    info = np.where(finite[..., None, None], info, 0.0)
+    # A point without information must not decide whether a camera is possible: it goes to the centre.
+    known = info.sum((-1, -2)) != 0
+    grid_a = np.where((finite & known)[..., None], grid_a, centre)
+    grid_b = np.where((finite & known)[..., None], grid_b, centre)
+    S = square_root_information(info)
+    half, diff = 0.5 * (info[..., 0, 0] + info[..., 1, 1]), 0.5 * (info[..., 0, 0] - info[..., 1, 1])
+    spread = np.sqrt(diff**2 + info[..., 0, 1] ** 2)
+    # A direction worse than 1 px counts as unknown. kappa widens the edge but does not remove measurements.
+    kappa = np.array([e.kappa for e in edges]).reshape(-1, 1)
+    dof = ((half - spread) * kappa > 1).astype(float) + ((half + spread) * kappa > 1)
+    return Packed(
+        ia=np.array([rows[e.a] for e in edges], int), ib=np.array([rows[e.b] for e in edges], int),
+        a_x=grid_a[..., 0].copy(), a_y=grid_a[..., 1].copy(), b_x=grid_b[..., 0].copy(), b_y=grid_b[..., 1].copy(),
+        s11=S[..., 0, 0].copy(), s12=S[..., 0, 1].copy(), s22=S[..., 1, 1].copy(), dof=dof,
+        H=np.array([e.H for e in edges], float).reshape(-1, 3, 3),
+        n_frames=len(graph.frames), size_px=graph.size_px,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Unknowns of S starts: log_f (S, n), R (S, n, 3, 3), shared (S, 5) = pp_x, pp_y, log aspect, c0, c1."""
+
+    log_f: Array
+    R: Array
+    shared: Array
+
+    def pick(self, which: NDArray[np.int64] | slice) -> State:
+        """Some of the starts."""
+        return State(self.log_f[which], self.R[which], self.shared[which])
+
+    def moved(self, frames: Array, shared: Array) -> State:
+        """Steps (S, n, 4) and (S, 5) applied: rotations from the left, made orthonormal again."""
+        R = rotation.orthonormalise(rotation.exp(frames[..., 1:]) @ self.R)
+        return State(self.log_f + frames[..., 0], R, self.shared + shared)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearised:
+    """cost (S,) robust; blocks (S, E, 13, 13), gradient (S, E, 13) of half the cost's negative slope (J^T W r);
+
+    e2 (S, E, m) squared whitened residuals. An impossible state has cost inf.
+    """
+
+    cost: Array
+    blocks: Array
+    gradient: Array
+    e2: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Robust loss over points: 'huber' or 'tukey' with thresholds in units of scale (S,) times the stated sigma."""
+
+    kind: str
+    scale: Array
+    huber: float = 3.0
+    tukey: float = 4.7
+
+    def pick(self, which: NDArray[np.int64]) -> Loss:
+        """The loss of some of the starts."""
+        return Loss(self.kind, self.scale[which], self.huber, self.tukey)
+
+    def value_and_weight(self, e2: Array) -> tuple[Array, Array]:
+        """rho(e) and rho'(e) / 2e, both (S, E, m)."""
+        if self.kind == "tukey":
+            c2 = (self.tukey * self.scale[:, None, None]) ** 2
+            left = np.maximum(1 - e2 / c2, 0.0)
+            return c2 / 3 * (1 - left**3), left**2
+        k = self.huber * self.scale[:, None, None]
+        e = np.sqrt(e2)
+        far = e > k
+        return np.where(far, 2 * k * e - k * k, e2), np.where(far, k / np.where(far, e, 1.0), 1.0)
+
+
+def _chunks(n_edges: int, n_starts: int, m: int) -> list[slice]:
+    size = max(1, CHUNK_POINTS // max(1, n_starts * m))
+    return [slice(k, min(k + size, n_edges)) for k in range(0, n_edges, size)]
+
+
+def residuals(packed: Packed, state: State, which: slice = slice(None), *, jacobian: bool = False) -> tuple[Array, ...]:
+    """Raw residuals r_x, r_y (S, E, m) px of measured minus predicted, and the Jacobian of the prediction or None."""
+    ia, ib = packed.ia[which], packed.ib[which]
+    Ra, Rb = state.R[:, ia], state.R[:, ib]
+    out = camera.transfer(
+        packed.a_x[which], packed.a_y[which], state.log_f[:, ia], state.log_f[:, ib],
+        Rb @ np.swapaxes(Ra, -1, -2), state.shared[:, None], packed.size_px[0], jacobian=jacobian,
+    )  # fmt: skip
+    return packed.b_x[which] - out.x, packed.b_y[which] - out.y, out.J  # type: ignore[return-value]
+
+
+def whitened_squares(packed: Packed, state: State) -> Array:
+    """Squared whitened residuals e2 (S, E, m); inf where a point cannot be transferred."""
+    out = np.empty((len(state.log_f), packed.n_edges, packed.dof.shape[1]))
+    with np.errstate(all="ignore"):
+        for part in _chunks(*out.shape[1::-1], out.shape[2]):
+            rx, ry, _ = residuals(packed, state, part)
+            s11, s12, s22 = packed.s11[part], packed.s12[part], packed.s22[part]
+            e2 = (s11 * rx + s12 * ry) ** 2 + (s12 * rx + s22 * ry) ** 2
+            out[:, part] = np.where(packed.dof[part] > 0, np.where(np.isnan(e2), np.inf, e2), 0.0)
+    return out
+
+
+def linearise(packed: Packed, state: State, loss: Loss) -> Linearised:
+    """Cost, normal blocks and gradients per edge at a state."""
+    S, E, m = len(state.log_f), packed.n_edges, packed.dof.shape[1]
+    blocks, gradient = np.empty((S, E, 13, 13)), np.empty((S, E, 13))
+    e2_all, cost = np.empty((S, E, m)), np.zeros(S)
+    with np.errstate(all="ignore"):
+        for part in _chunks(E, S, m):
+            rx, ry, J = residuals(packed, state, part, jacobian=True)
+            s11, s12, s22 = packed.s11[part], packed.s12[part], packed.s22[part]
+            known = packed.dof[part] > 0
+            ex, ey = s11 * rx + s12 * ry, s12 * rx + s22 * ry
+            e2 = np.where(known, ex * ex + ey * ey, 0.0)
+            value, weight = loss.value_and_weight(e2)
+            cost += value.sum((1, 2))
+            root = np.sqrt(weight)
+            e = np.stack([ex * root, ey * root], -2).reshape(S, -1, 2 * m, 1)
+            w11, w12, w22 = s11 * root, s12 * root, s22 * root
+            Jw = np.empty_like(J)
+            np.multiply(J[..., 0, :], w11[..., None, :], out=Jw[..., 0, :])
+            Jw[..., 0, :] += J[..., 1, :] * w12[..., None, :]
+            np.multiply(J[..., 1, :], w22[..., None, :], out=Jw[..., 1, :])
+            Jw[..., 1, :] += J[..., 0, :] * w12[..., None, :]
+            Jw = Jw.reshape(S, -1, 13, 2 * m)
+            blocks[:, part] = Jw @ np.swapaxes(Jw, -1, -2)
+            gradient[:, part] = (Jw @ e)[..., 0]
+            e2_all[:, part] = e2
+    bad = ~np.isfinite(cost)
+    cost[bad] = np.inf
+    return Linearised(cost, blocks, gradient, e2_all)
+
+
+def robust_scale(e2: Array, dof: Array) -> Array:
+    """Scale (S,) of whitened residuals from their median, at least 1 (the stated noise), over the known points.
+
+    1.177 = median of |e| for two unit-variance components; an edge with one known direction per point lowers it a bit.
+    """
+    known = dof > 0
+    if not known.any():
+        return np.ones(len(e2))
+    values = np.where(np.isfinite(e2[:, known]), e2[:, known], 1e30)
+    return np.maximum(1.0, np.sqrt(np.median(values, axis=1)) / 1.177)
+
+
+class PriorTerms:
+    """Gaussian priors as additions to cost, normal matrix and gradient; `free` says which shared columns move."""
+
+    def __init__(self, priors: Priors, size_px: tuple[int, int], frames: NDArray[np.int64], free: Array) -> None:
+        W = size_px[0]
+        self.mean = np.array([*priors.pp_mean_px(size_px), np.log(priors.aspect), priors.c0_mean, priors.c1_mean])
+        self.std = np.array(
+            [priors.pp_std_x * W, priors.pp_std_y * W, max(priors.aspect_std, 1e-9), priors.c0_std, priors.c1_std]
+        )
+        self.free = np.asarray(free, bool)
+        self.precision = np.where(self.free, 1 / self.std**2, 0.0)
+        self.mean_log_f, self.mean_precision = priors.log_f_mean + np.log(W), 1 / priors.log_f_std**2
+        rows = {frame: k for k, frame in enumerate(frames.tolist())}
+        known = [(rows[p.frame], np.log(p.f_px), (p.f_px / p.std_px) ** 2) for p in priors.known_focals if p.frame in rows]
+        self.known_row = np.array([k for k, _, _ in known], int)
+        self.known_log_f = np.array([v for _, v, _ in known], float)
+        self.known_precision = np.array([w for _, _, w in known], float)
+
+    def cost(self, state: State) -> Array:
+        """Sum of squared prior residuals (S,)."""
+        out = np.sum(self.precision * (state.shared - self.mean) ** 2, -1)
+        out = out + self.mean_precision * (state.log_f.mean(-1) - self.mean_log_f) ** 2
+        return out + np.sum(self.known_precision * (state.log_f[:, self.known_row] - self.known_log_f) ** 2, -1)
+
+    def shared_gradient(self, state: State) -> Array:
+        """J^T W r of the shared parameters (S, 5)."""
+        return self.precision * (self.mean - state.shared)
+
+    def mean_gradient(self, state: State) -> Array:
+        """Precision times residual of the mean-log-f prior (S,): gradient / n on every log f."""
+        return self.mean_precision * (self.mean_log_f - state.log_f.mean(-1))

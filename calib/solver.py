@@ -1,0 +1,247 @@
+"""Levenberg-Marquardt over a batch of starts: assemble, damp, step, accept or reject, stop. No images, no priors' meaning.
+
+Unknowns: 4 per frame (log f, left rotation increment) and the free ones of 5 shared. Below DENSE_BELOW pose unknowns
+the normal matrix is dense (one Cholesky per start); above, block-sparse frames with a bordered Schur complement.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from calib.camera import N_SHARED
+from calib.problem import Linearised, Loss, Packed, PriorTerms, State, linearise
+
+Array = NDArray[np.float64]
+DENSE_BELOW = 600
+MAX_LOG_F_STEP = 0.5
+MAX_ROTATION_STEP = 0.3
+
+
+class Layout:
+    """Which unknown is where: 4 n pose entries, then 5 shared; `active` (4 n + 5,) False = held (gauge, fixed lens)."""
+
+    def __init__(self, packed: Packed, reference: int, free_shared: Array, held: NDArray[np.bool_] | None = None) -> None:
+        n = packed.n_frames
+        self.n, self.size = n, 4 * n + N_SHARED
+        self.active = np.ones(self.size, bool)
+        self.active[4 * reference + 1 : 4 * reference + 4] = False
+        self.active[4 * n :] = np.asarray(free_shared, bool)
+        if held is not None:
+            self.active[: 4 * n] &= ~np.repeat(held, 4)
+        a = 4 * packed.ia[:, None] + np.arange(4)
+        b = 4 * packed.ib[:, None] + np.arange(4)
+        shared = np.broadcast_to(4 * n + np.arange(N_SHARED), (packed.n_edges, N_SHARED))
+        self.columns = np.concatenate([a, b, shared], 1)  # (E, 13)
+        self.dense = 4 * n < DENSE_BELOW
+        self._gather: sp.csr_array | None = None
+
+    def vector(self, per_edge: Array) -> Array:
+        """Sum of per-edge vectors (S, E, 13) into (S, 4 n + 5)."""
+        flat = self.columns.ravel()
+        return np.stack([np.bincount(flat, row.ravel(), self.size) for row in per_edge])
+
+    def matrices(self, blocks: Array) -> Array:
+        """Sum of per-edge blocks (S, E, 13, 13) into dense (S, N, N)."""
+        if self._gather is None:
+            # float summation through one sparse matrix: much faster than np.add.at, fixed order.
+            rows = (self.columns[:, :, None] * self.size + self.columns[:, None, :]).ravel()
+            self._gather = sp.csr_array(
+                (np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(self.size**2, len(rows))
+            )
+        out = self._gather @ blocks.reshape(len(blocks), -1).T
+        return np.ascontiguousarray(out.T).reshape(-1, self.size, self.size)
+
+
+class NormalEquations:
+    """Normal matrix of one state for every start, with its priors; `solve` damps it, `inverse` gives the covariance."""
+
+    def __init__(self, layout: Layout, priors: PriorTerms, state: State, lin: Linearised) -> None:
+        self.layout, self.priors = layout, priors
+        n, N = layout.n, layout.size
+        self.gradient = layout.vector(lin.gradient)
+        self.gradient[:, 4 * n :] += priors.shared_gradient(state)
+        self.gradient[:, 0 : 4 * n : 4] += priors.mean_gradient(state)[:, None] / n
+        for row, value, weight in zip(priors.known_row, priors.known_log_f, priors.known_precision, strict=True):
+            self.gradient[:, 4 * row] += weight * (value - state.log_f[:, row])
+        self.gradient[:, ~layout.active] = 0.0
+        self.extra = np.zeros(N)
+        self.extra[4 * n :] = priors.precision
+        np.add.at(self.extra, 4 * priors.known_row, priors.known_precision)
+        self.mean_weight = priors.mean_precision / n**2
+        if layout.dense:
+            A = layout.matrices(lin.blocks)
+            A[:, np.arange(N), np.arange(N)] += self.extra
+            lam = np.arange(0, 4 * n, 4)
+            A[:, lam[:, None], lam[None, :]] += self.mean_weight
+            held = ~layout.active
+            A[:, held, :] = 0.0
+            A[:, :, held] = 0.0
+            A[:, held, held] = 1.0
+            self.dense: Array | None = A
+            self.diagonal = np.diagonal(A, axis1=1, axis2=2).copy()
+        else:
+            self.dense = None
+            self._sparse(lin)
+
+    def _sparse(self, lin: Linearised) -> None:
+        layout = self.layout
+        cols, n, N = layout.columns, layout.n, layout.size
+        rows = np.repeat(cols, 13, axis=1).ravel()
+        full = sp.coo_array(
+            (lin.blocks[0].ravel(), (rows, np.tile(cols, (1, 13)).ravel())), shape=(N, N)
+        ).tocsc() + sp.diags_array(self.extra)
+        keep = np.flatnonzero(layout.active)
+        self.poses, self.lens = keep[keep < 4 * n], keep[keep >= 4 * n]
+        full = full.tocsc()
+        self.A = full[self.poses][:, self.poses].tocsc()
+        u = (self.poses % 4 == 0).astype(float)[:, None]
+        # The mean-log-f prior is rank one: as a bordered variable it keeps A sparse.
+        self.B = np.hstack([full[self.poses][:, self.lens].toarray(), u])
+        k = len(self.lens)
+        self.D = np.zeros((k + 1, k + 1))
+        self.D[:k, :k] = full[self.lens][:, self.lens].toarray()
+        self.D[k, k] = -1 / self.mean_weight
+        self.diagonal = np.ones((1, N))
+        self.diagonal[0, keep] = full.diagonal()[keep]
+
+    def solve(self, start: int, damping: float) -> Array:
+        """Damped step (4 n + 5,) of one start. Raises numpy.linalg.LinAlgError when the matrix is singular."""
+        scale = 1 / np.sqrt(np.maximum(self.diagonal[start], 1e-300))
+        if self.dense is not None:
+            M = self.dense[start] * scale[:, None] * scale[None, :]
+            M[np.diag_indices_from(M)] += damping
+            factor = scipy.linalg.cho_factor(M, lower=True, overwrite_a=True, check_finite=False)
+            return scale * scipy.linalg.cho_solve(factor, scale * self.gradient[start], check_finite=False)
+        step = np.zeros(self.layout.size)
+        solution = self._bordered(damping, self.gradient[0][np.concatenate([self.poses, self.lens])][:, None])
+        step[np.concatenate([self.poses, self.lens])] = solution[:, 0]
+        return step
+
+    def _bordered(self, damping: float, right: Array) -> Array:
+        k, p = len(self.lens), len(self.poses)
+        A = (self.A + sp.diags_array(damping * self.A.diagonal())).tocsc()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                factor = spla.splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        except (RuntimeError, Warning) as error:
+            raise np.linalg.LinAlgError(str(error)) from error
+        Y = factor.solve(np.hstack([self.B, right[:p]]))
+        YB, Yg = Y[:, : k + 1], Y[:, k + 1 :]
+        D = self.D.copy()
+        D[np.arange(k), np.arange(k)] *= 1 + damping
+        lower = np.vstack([right[p:], np.zeros((1, right.shape[1]))]) - self.B.T @ Yg
+        shared = np.linalg.solve(D - self.B.T @ YB, lower)
+        return np.vstack([Yg - YB @ shared, shared[:k]])
+
+    def covariance(self, start: int = 0) -> Array:
+        """Inverse of the undamped matrix, (4 n + 5, 4 n + 5), zero rows for held unknowns. Dense: n up to ~1000.
+
+        Raises numpy.linalg.LinAlgError when singular.
+        """
+        N = self.layout.size
+        active = self.layout.active
+        out = np.zeros((N, N))
+        if self.dense is not None:
+            scale = 1 / np.sqrt(np.maximum(self.diagonal[start][active], 1e-300))
+            M = self.dense[start][np.ix_(active, active)] * scale[:, None] * scale[None, :]
+            factor = scipy.linalg.cho_factor(M, lower=True)
+            inverse = scipy.linalg.cho_solve(factor, np.eye(len(M)))
+            out[np.ix_(active, active)] = inverse * scale[:, None] * scale[None, :]
+            return out
+        order = np.concatenate([self.poses, self.lens])
+        out[np.ix_(order, order)] = self._bordered(0.0, np.eye(len(order)))
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """States of all starts after the iteration: cost (S,), converged (S,), n_steps (S,), stop reasons, last linearisation."""
+
+    state: State
+    cost: Array
+    converged: NDArray[np.bool_]
+    n_steps: NDArray[np.int64]
+    stop: list[str]
+    lin: Linearised
+
+
+def minimise(
+    packed: Packed,
+    layout: Layout,
+    priors: PriorTerms,
+    state: State,
+    loss: Loss,
+    *,
+    max_steps: int,
+    tolerance: float,
+    damping0: float = 1e-4,
+) -> Result:
+    """Levenberg-Marquardt on every start at once; each has its own damping and stops by itself.
+
+    Stops on an accepted step whose relative cost change is below `tolerance`, or when the predicted decrease is
+    below rounding. A rejected step leaves the estimate untouched. Never raises on singular systems.
+    """
+    S, n = len(state.log_f), layout.n
+    lin = linearise(packed, state, loss)
+    cost = lin.cost + priors.cost(state)
+    damping = np.full(S, damping0)
+    steps, converged = np.zeros(S, int), np.zeros(S, bool)
+    stop = ["max_steps"] * S
+    running = np.isfinite(cost)
+    for k in np.flatnonzero(~running):
+        stop[k] = "impossible_start"
+    log_f, R, shared = state.log_f.copy(), state.R.copy(), state.shared.copy()
+    blocks, gradient, e2 = lin.blocks, lin.gradient, lin.e2
+    while running.any():
+        live = np.flatnonzero(running)
+        now = State(log_f[live], R[live], shared[live])
+        equations = NormalEquations(layout, priors, now, Linearised(cost[live], blocks[live], gradient[live], e2[live]))
+        pending = list(range(len(live)))
+        step = np.zeros((len(live), layout.size))
+        usable = np.zeros(len(live), bool)
+        for j in pending:
+            try:
+                step[j] = equations.solve(j, damping[live[j]])
+                usable[j] = np.isfinite(step[j]).all()
+            except np.linalg.LinAlgError:
+                usable[j] = False
+        frames = step[:, : 4 * n].reshape(-1, n, 4)
+        # One common factor per start keeps the direction (a component-wise clamp would not descend).
+        largest = np.maximum(
+            np.abs(frames[..., 0]).max(1, initial=0.0) / MAX_LOG_F_STEP,
+            np.abs(frames[..., 1:]).max((1, 2), initial=0.0) / MAX_ROTATION_STEP,
+        )
+        step /= np.maximum(largest, 1.0)[:, None]
+        clamped = largest > 1
+        frames = step[:, : 4 * n].reshape(-1, n, 4)
+        trial = now.moved(frames, step[:, 4 * n :])
+        new = linearise(packed, trial, loss.pick(live))
+        new_cost = new.cost + priors.cost(trial)
+        new_cost = np.where(usable, new_cost, np.inf)
+        predicted = np.sum(step * equations.gradient, 1)
+        for j, k in enumerate(live):
+            steps[k] += 1
+            if new_cost[j] <= cost[k]:
+                change = (cost[k] - new_cost[j]) / max(cost[k], 1e-300)
+                log_f[k], R[k], shared[k] = trial.log_f[j], trial.R[j], trial.shared[j]
+                cost[k], blocks[k], gradient[k], e2[k] = new_cost[j], new.blocks[j], new.gradient[j], new.e2[j]
+                if change < tolerance and not clamped[j] and damping[k] < 1e-2:
+                    running[k], converged[k], stop[k] = False, True, "converged"
+                damping[k] = max(damping[k] * 0.1, 1e-12)
+            else:
+                if usable[j] and abs(predicted[j]) < 1e-13 * max(cost[k], 1.0) and damping[k] < 1e-2:
+                    running[k], converged[k], stop[k] = False, True, "rounding"
+                damping[k] = max(damping[k], 1e-8) * 10
+                if damping[k] > 1e8:
+                    running[k], stop[k] = False, "singular" if not usable[j] else "diverged"
+            if running[k] and steps[k] >= max_steps:
+                running[k] = False
+    return Result(State(log_f, R, shared), cost, converged, steps, stop, Linearised(cost, blocks, gradient, e2))
