@@ -74,6 +74,14 @@ def linked_frames(packed: Packed, ok: NDArray[np.bool_], reference: int) -> NDAr
     return np.asarray(label == label[reference])
 
 
+def linked_to(packed: Packed, ok: NDArray[np.bool_], roots: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Frames (n,) that accepted edges join to any of the root frames (n,) bool."""
+    n = packed.n_frames
+    link = coo_array((np.ones(int(ok.sum())), (packed.ia[ok], packed.ib[ok])), shape=(n, n))
+    _, label = connected_components(link, directed=False)
+    return np.isin(label, np.unique(label[roots]))
+
+
 def find_bad_edges(e2: Array, packed: Packed, limit: float) -> NDArray[np.bool_]:
     """Edges (E,) whose median whitened residual is beyond `limit` times the graph's median (at least the stated noise).
 

@@ -1,0 +1,265 @@
+"""Poses of the frames between keyframes, with the keyframes and the lens held: 4 unknowns a frame, O(n).
+
+Edges may link a frame to a held keyframe or to another free frame. The linear system is block-sparse; error bars come
+from a block-tridiagonal recursion over groups of frames as wide as the longest link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from calib.covariance import edge_statistics
+from calib.problem import Loss, Packed, State, linearise, pack, robust_scale, whitened_squares
+from calib.records import HomographyGraph, Solution
+from calib.refine import find_bad_edges, linked_to, state_from_solution
+
+Array = NDArray[np.float64]
+MAX_BAND = 12  # frames: links between free frames that reach further get their error bars from single solves
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseOptions:
+    """How solve_poses() works. huber in sigmas times the robust scale; bad_edge as in RefineOptions; tolerance relative."""
+
+    huber: float = 3.0
+    bad_edge: float = 6.0
+    max_steps: int = 30
+    tolerance: float = 1e-6
+
+
+class _PoseSystem:
+    """Normal equations of the free frames: block rows in frame order."""
+
+    def __init__(self, packed: Packed, free: NDArray[np.bool_]) -> None:
+        self.free = np.flatnonzero(free)
+        position = np.full(packed.n_frames, -1)
+        position[self.free] = np.arange(len(self.free))
+        self.pa, self.pb = position[packed.ia], position[packed.ib]
+        both = (self.pa >= 0) & (self.pb >= 0)
+        self.both = np.flatnonzero(both)
+        self.band = int(np.abs(self.pa[both] - self.pb[both]).max(initial=1))
+        self.size = 4 * len(self.free)
+
+    def assemble(self, blocks: Array, gradient: Array) -> tuple[Array, Array, Array]:
+        """Diagonal blocks (n, 4, 4), gradients (n, 4) and coupling blocks (k, 4, 4) of the free pairs (rows of a)."""
+        n = len(self.free)
+        diagonal, right = np.zeros((n, 4, 4)), np.zeros((n, 4))
+        for where, part in ((self.pa, slice(0, 4)), (self.pb, slice(4, 8))):
+            use = where >= 0
+            for i in range(4):
+                right[:, i] += np.bincount(where[use], gradient[use, part.start + i], n)
+                for j in range(4):
+                    diagonal[:, i, j] += np.bincount(where[use], blocks[use, part.start + i, part.start + j], n)
+        return diagonal, right, blocks[self.both, 0:4, 4:8]
+
+    def matrix(self, diagonal: Array, coupling: Array) -> sp.csc_array:
+        """The sparse matrix (4 n, 4 n)."""
+        n = len(self.free)
+        four = np.arange(4)
+
+        def entries(rows: Array, cols: Array) -> tuple[Array, Array]:
+            r = np.broadcast_to(4 * rows[:, None, None] + four[:, None], (len(rows), 4, 4))
+            c = np.broadcast_to(4 * cols[:, None, None] + four[None, :], (len(rows), 4, 4))
+            return r.ravel(), c.ravel()
+
+        index = np.arange(n)
+        a, b = self.pa[self.both], self.pb[self.both]
+        parts = [(*entries(index, index), diagonal), (*entries(a, b), coupling)]
+        parts.append((*entries(b, a), np.swapaxes(coupling, 1, 2)))
+        rows, cols = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+        values = np.concatenate([p[2].ravel() for p in parts])
+        return sp.coo_array((values, (rows, cols)), shape=(self.size, self.size)).tocsc()
+
+
+def inverse_diagonal_blocks(A: sp.csc_array, band: int) -> Array:
+    """4 x 4 diagonal blocks (n, 4, 4) of A^-1 for a block-banded positive matrix, links up to `band` blocks apart.
+
+    Two-way block recursion (calibration.md 6.6), O(n band^2). Raises numpy.linalg.LinAlgError when singular.
+    """
+    n = A.shape[0] // 4
+    size = 4 * band
+    starts = list(range(0, 4 * n, size))
+    stops = [min(s + size, 4 * n) for s in starts]
+    A = A.tocsr()
+    T, X = [], []
+    for k, (s, e) in enumerate(zip(starts, stops, strict=True)):
+        block = A[s:e, s:e].toarray()
+        if k:
+            U = A[starts[k - 1] : s, s:e].toarray()
+            gain = np.linalg.solve(T[-1], U)
+            X.append(gain)
+            block = block - U.T @ gain
+        T.append(block)
+    out = np.zeros((n, 4, 4))
+    P = np.zeros((0, 0))
+    for k in range(len(starts) - 1, -1, -1):
+        inverse = np.linalg.inv(T[k])
+        P = inverse if k == len(starts) - 1 else inverse + X[k] @ P @ X[k].T
+        for j in range((stops[k] - starts[k]) // 4):
+            out[starts[k] // 4 + j] = P[4 * j : 4 * j + 4, 4 * j : 4 * j + 4]
+    return out
+
+
+def _iterate(
+    packed: Packed, system: _PoseSystem, state: State, loss: Loss, options: PoseOptions
+) -> tuple[State, float, bool, int, sp.csc_array | None]:
+    """Levenberg-Marquardt on the free frames: state, cost, converged, steps, undamped matrix at the end."""
+    lin = linearise(packed, state, loss)
+    cost, damping, shared = float(lin.cost[0]), 1e-6, np.zeros((1, 5))
+    if not np.isfinite(cost):
+        return state, cost, False, 0, None
+    step_count = 0
+    matrix, converged = None, False
+    for step_count in range(1, options.max_steps + 1):  # noqa: B007
+        diagonal, right, coupling = system.assemble(lin.blocks[0], lin.gradient[0])
+        matrix = system.matrix(diagonal, coupling)
+        damped = (matrix + sp.diags_array(damping * matrix.diagonal() + 1e-12)).tocsc()
+        try:
+            step = spla.splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right.ravel())
+        except RuntimeError:
+            return state, cost, False, step_count, None
+        step = step.reshape(-1, 4)
+        # Frames are nearly independent: each is clamped by itself.
+        largest = np.maximum(np.abs(step[:, 0]) / 0.3, np.abs(step[:, 1:]).max(1) / 0.2)
+        step = step / np.maximum(largest, 1.0)[:, None]
+        full = np.zeros((1, packed.n_frames, 4))
+        full[0, system.free] = step
+        trial = state.moved(full, shared)
+        new = linearise(packed, trial, loss)
+        if float(new.cost[0]) <= cost:
+            change = (cost - float(new.cost[0])) / max(cost, 1e-300)
+            state, lin, cost = trial, new, float(new.cost[0])
+            damping = max(damping * 0.1, 1e-12)
+            if change < options.tolerance and largest.max() < 1:
+                converged = True
+                break
+        else:
+            if np.abs(np.sum(step * right)) < 1e-12 * max(cost, 1.0):
+                converged = True
+                break
+            damping = max(damping, 1e-8) * 100
+            if damping > 1e8:
+                break
+    diagonal, _, coupling = system.assemble(lin.blocks[0], lin.gradient[0])
+    return state, cost, converged, step_count, system.matrix(diagonal, coupling)
+
+
+def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions | None = None) -> Solution:
+    """Cameras of all frames of `graph`: those in `held` as they are there, the others solved against them.
+
+    graph: frames and edges; edges may join free frames. held: keyframes, lens and their error bars.
+    Returns a Solution over graph.frames. sigma_log_f is the own error of the pose combined with the held frames' error
+    (interpolated in frame number); sigma_log_zoom likewise. Frames without a path to a held frame are NaN rows.
+    Raises ValueError when none of the graph's frames is held.
+    """
+    options = options or PoseOptions()
+    rows = {frame: k for k, frame in enumerate(held.frames.tolist()) if np.isfinite(held.log_f[k])}
+    is_held = np.array([frame in rows for frame in graph.frames.tolist()])
+    if not is_held.any():
+        raise ValueError("solve_poses() needs at least one frame of the graph in `held`")
+    everything = pack(graph)
+    useful = everything.dof.sum(1) >= 6
+    packed = everything.select(useful)
+    reference = int(np.flatnonzero(is_held)[0])
+    state = _initial(packed, graph, held, reference)
+    free = ~is_held
+    reach = linked_to(packed, np.ones(packed.n_edges, bool), is_held)
+    free &= reach
+    ok = reach[packed.ia] & reach[packed.ib]
+    e2 = whitened_squares(packed, state)
+    n_steps, converged, cost, matrix = 0, True, 0.0, None
+    system = _PoseSystem(packed.select(ok), free)
+    loss = Loss("huber", np.ones(1), options.huber)
+    for look in range(2):
+        fit = ok & (free[packed.ia] | free[packed.ib])
+        if not fit.any():
+            break
+        chosen = packed.select(fit)
+        scale = robust_scale(whitened_squares(chosen, state), chosen.dof)
+        loss = Loss("huber", scale, options.huber)
+        system = _PoseSystem(chosen, free)
+        state, cost, converged, steps, matrix = _iterate(chosen, system, state, loss, options)
+        n_steps += steps
+        e2 = whitened_squares(packed, state)
+        now = ok & ~find_bad_edges(e2[0], packed, options.bad_edge)
+        reach = linked_to(packed, now, is_held)
+        if look == 1 or (now == ok).all():
+            break
+        ok, free = now & reach[packed.ia] & reach[packed.ib], ~is_held & reach
+    return _summarise(graph, held, packed, useful, state, is_held, free, ok, system, matrix, loss, cost, converged, n_steps)
+
+
+def _initial(packed: Packed, graph: HomographyGraph, held: Solution, reference: int) -> State:
+    """State with the held cameras in their own gauge (reference of `held`), the others chained."""
+    state = state_from_solution(packed, graph.frames, held, reference)
+    # state_from_solution puts the reference row at I; go back to the held world axes.
+    back = held.R[held.index(int(graph.frames[reference]))]
+    return State(state.log_f, state.R @ back, state.shared)
+
+
+def _summarise(
+    graph: HomographyGraph, held: Solution, packed: Packed, useful: NDArray[np.bool_], state: State,
+    is_held: NDArray[np.bool_], free: NDArray[np.bool_], ok: NDArray[np.bool_], system: _PoseSystem,
+    matrix: sp.csc_array | None, loss: Loss, cost: float, converged: bool, n_steps: int,
+) -> Solution:  # fmt: skip
+    n = len(graph.frames)
+    chi2, kappa, _, rms_edge = edge_statistics(packed, state, loss)
+    own = np.full((n, 4, 4), np.nan)
+    own[is_held] = 0.0
+    fit = ok & (free[packed.ia] | free[packed.ib])
+    dof = max(float(packed.dof[fit].sum()) - 4 * int(free.sum()), 1.0)
+    with np.errstate(all="ignore"):
+        chi2_dof = float(np.nansum((chi2 * packed.dof.sum(1))[fit]) / dof) if fit.any() else float("nan")
+    # An edge's errors are common to its cells: kappa, where the data show it; at least chi2.
+    inflate = max(1.0, chi2_dof if np.isfinite(chi2_dof) else 1.0, float(np.nanmean(kappa[fit])) if fit.any() else 1.0)
+    if matrix is not None and len(system.free):
+        try:
+            if system.band <= MAX_BAND:
+                blocks = inverse_diagonal_blocks(matrix, system.band)
+            else:
+                lu = spla.splu(matrix.tocsc())
+                blocks = np.stack([lu.solve(np.eye(system.size, 4, -4 * k))[4 * k : 4 * k + 4] for k in range(system.size // 4)])
+            own[system.free] = blocks * inflate
+        except (np.linalg.LinAlgError, RuntimeError):
+            converged = False
+    rows = np.array([held.index(f) if h else -1 for f, h in zip(graph.frames.tolist(), is_held, strict=True)])
+    fine = np.isfinite(held.log_f)
+    order = np.argsort(held.frames[fine])
+
+    def common(values: Array) -> Array:
+        return np.interp(graph.frames, held.frames[fine][order], values[fine][order])
+
+    sigma_log_f = np.sqrt(common(held.sigma_log_f) ** 2 + own[:, 0, 0])
+    sigma_zoom = np.sqrt(common(held.sigma_log_zoom) ** 2 + own[:, 0, 0])
+    cov_rot = own[:, 1:, 1:].copy()
+    cov_rot[is_held] = held.cov_rot[rows[is_held]]
+    log_f, R = state.log_f[0].copy(), state.R[0].copy()
+    lost = ~is_held & ~free
+    for values in (log_f, R, sigma_log_f, sigma_zoom, cov_rot):
+        values[lost] = np.nan
+    rms = np.full(n, np.nan)
+    total, count = np.zeros(n), np.zeros(n)
+    good = ok & np.isfinite(rms_edge)
+    for index in (packed.ia[good], packed.ib[good]):
+        total += np.bincount(index, rms_edge[good] ** 2, n)
+        count += np.bincount(index, minlength=n)
+    rms[count > 0] = np.sqrt(total[count > 0] / count[count > 0])
+
+    def per_edge(values: Array) -> Array:
+        out = np.full(len(graph.edges), np.nan)
+        out[useful] = values
+        return out
+
+    edge_ok = np.zeros(len(graph.edges), bool)
+    edge_ok[useful] = ok
+    return replace(
+        held, frames=graph.frames, log_f=log_f, R=R, sigma_log_f=sigma_log_f, sigma_log_zoom=sigma_zoom,
+        cov_rot=cov_rot, edge_chi2=per_edge(chi2), edge_kappa=per_edge(kappa), edge_ok=edge_ok, rms_px=rms,
+        chi2_dof=chi2_dof, converged=converged, stop="converged" if converged else "max_steps",
+        n_steps=n_steps, cost=cost, starts=(),
+    )  # fmt: skip
