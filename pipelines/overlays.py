@@ -1,0 +1,233 @@
+"""What is fixed to the screen while the scene moves: scoreboards, logos, letterbox bars. A mask of the usable scene.
+
+Running statistics at a quarter of the size over frames between which the camera has moved: where the camera rests,
+everything looks fixed. Edges that stay where they are while the scene passes seed a graphic; the pixels between them
+that hardly change fill it (seeds alone find 70 % of a board, small deviation alone takes flat grass along).
+Not found: graphics that appear for fewer than `min_samples` samples; those are the robust weights' business.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pipelines.config import OverlayOptions
+
+SCALE = 4  # a graphic narrower than two such pixels is below what registration notices
+MEMORY = 60  # samples after which old ones fade, so that a board that goes away is let go
+MOVING_PX = 0.5  # motion per frame below which the camera rests; jitter must not add up to a pan
+SEED_T = 6.0  # mean edge strength over its standard error: Student's t with 11 degrees makes 5e-5 false seeds
+JOIN = 4  # quarter px; seeds this near belong to one graphic: the gap between two words
+MIN_SEEDS = 6  # of each direction in a graphic
+DARK_GREY = (
+    24.0  # limited-range black is 16; coding noise adds some (formats: 99th percentile <= 24 gave exact bars)
+)
+BAR_EVERY = 12  # frames between two looks at the bars; they need no motion
+MAX_SHARE = 0.4  # of the frame; above it the camera has not really moved, and nothing is said
+
+
+class OverlayFinder:
+    """Feed it every frame with the camera's motion since the one before; ask for the mask at any time."""
+
+    def __init__(self, size_px: tuple[int, int], options: OverlayOptions | None = None) -> None:
+        self.size_px = size_px
+        self.options = options or OverlayOptions()
+        w, h = size_px
+        small = (h // SCALE, w // SCALE)
+        self.n_samples = 0
+        self._since_px = np.inf
+        self._moments: NDArray[np.float32] = np.zeros(
+            (3, 2, *small), np.float32
+        )  # of grey, gx, gy: mean, variance
+        self._n_updates = 0
+        self._n_bar = 0
+        self._dark_rows = np.zeros(h)
+        self._dark_columns = np.zeros(w)
+        self._found: tuple[int, int, NDArray[np.bool_] | None, dict[str, Any]] | None = None
+
+    def update(self, gray: NDArray[Any], motion_px: float) -> None:
+        """Take frame `gray` (h, w), 0..255, into account. motion_px: how far the picture moved since the last call.
+
+        NaN motion (a frame that was not registered) and small jitter count as rest. Costs nothing on most frames.
+        Raises ValueError when the size is not the one of the finder.
+        """
+        if not self.options.enabled:
+            return
+        if gray.shape != (self.size_px[1], self.size_px[0]):
+            raise ValueError(
+                f"frame is {gray.shape[1]}x{gray.shape[0]}, finder is {self.size_px[0]}x{self.size_px[1]}"
+            )
+        if self._n_updates % BAR_EVERY == 0:
+            self._look_at_bars(gray)
+        self._n_updates += 1
+        if np.isfinite(motion_px) and motion_px >= MOVING_PX:
+            self._since_px += motion_px
+        if self._since_px >= self.options.sample_motion * self.size_px[0]:
+            self._since_px = 0.0
+            self._sample(gray)
+
+    def mask(self) -> NDArray[np.bool_] | None:
+        """(h, w) bool, True = scene; None: nothing found, or not enough seen to say."""
+        return self._analyse()[0]
+
+    def facts(self) -> dict[str, Any]:
+        """For run.json: samples, bars in px, boxes of the graphics (x, y, w, h), masked share, why there are none."""
+        return self._analyse()[1]
+
+    def _sample(self, gray: NDArray[Any]) -> None:
+        small = _shrink(gray)
+        gy, gx = np.gradient(small)
+        self.n_samples += 1
+        weight = np.float32(1.0 / min(self.n_samples, MEMORY))
+        for moments, value in zip(self._moments, (small, gx, gy), strict=True):
+            mean, variance = moments
+            away = value - mean
+            mean += weight * away
+            variance *= 1 - weight
+            variance += weight * (1 - weight) * away**2
+
+    def _look_at_bars(self, gray: NDArray[Any]) -> None:
+        step = max(1, self.size_px[0] // 480)
+        # The 99th percentile: a few bright pixels of coding noise or a clock do not make a row part of the scene.
+        rows = np.percentile(gray[:, ::step], 99, axis=1)
+        columns = np.percentile(gray[::step], 99, axis=0)
+        if np.percentile(rows, 75) <= 2 * DARK_GREY:
+            return  # a black or very dark picture says nothing about bars
+        self._n_bar += 1
+        self._dark_rows += rows <= DARK_GREY
+        self._dark_columns += columns <= DARK_GREY
+
+    def _analyse(self) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
+        if self._found is None or self._found[:2] != (self.n_samples, self._n_bar):
+            mask, facts = self._find()
+            if mask is not None:
+                mask.setflags(write=False)
+            self._found = (self.n_samples, self._n_bar, mask, facts)
+        return self._found[2], dict(self._found[3])
+
+    def _find(self) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
+        w, h = self.size_px
+        facts: dict[str, Any] = {
+            "enabled": self.options.enabled,
+            "samples": self.n_samples,
+            "graphics": [],
+            "bars": {},
+        }
+        overlay = np.zeros((h, w), bool)
+        top, bottom = _bars(self._dark_rows, self._n_bar)
+        left, right = _bars(self._dark_columns, self._n_bar)
+        if top or bottom or left or right:
+            facts["bars"] = {"top": top, "bottom": bottom, "left": left, "right": right}
+            # One px more: the codec rings across the edge of the bar.
+            overlay[: top + (top > 0)] = True
+            overlay[h - bottom - (bottom > 0) :] = True
+            overlay[:, : left + (left > 0)] = True
+            overlay[:, w - right - (right > 0) :] = True
+        reason = ""
+        if self.n_samples < self.options.min_samples:
+            reason = "camera_moved_too_little"
+        else:
+            graphics, boxes = self._graphics()
+            if graphics.mean() > MAX_SHARE:
+                reason = "too_much_looks_fixed"
+            else:
+                overlay |= graphics
+                facts["graphics"] = boxes
+        facts["reason"] = reason
+        facts["masked_share"] = float(overlay.mean())
+        return (~overlay if overlay.any() else None), facts
+
+    def _graphics(self) -> tuple[NDArray[np.bool_], list[dict[str, int]]]:
+        """(h, w) bool True = graphic, and a box (full px) for each."""
+        n = min(self.n_samples, MEMORY)
+        std, std_x, std_y = np.sqrt(self._moments[:, 1])
+        mean_x, mean_y = np.abs(self._moments[1:, 0])
+        # Above one deviation always: after many samples a tiny but steady slope (vignetting) would pass the test.
+        least = max(1.0, SEED_T / np.sqrt(n))
+        seed_x = (mean_x > self.options.min_gradient_grey) & (mean_x > least * std_x)
+        seed_y = (mean_y > self.options.min_gradient_grey) & (mean_y > least * std_y)
+        seeds = seed_x | seed_y
+        fixed = std < self.options.max_std_grey
+        groups, n_groups = ndimage.label(ndimage.binary_dilation(seeds, _disc(JOIN)))
+        found = np.zeros_like(seeds)
+        for group, box in zip(range(1, n_groups + 1), ndimage.find_objects(groups), strict=True):
+            mine = groups[box] == group
+            # The top edge of the hoardings stays in its row while the camera pans: a graphic has edges both ways.
+            if min((seed_x[box] & mine).sum(), (seed_y[box] & mine).sum()) < MIN_SEEDS:
+                continue
+            own = seeds[box] & mine
+            inside = own | (_between(own) & fixed[box])
+            inside = ndimage.binary_closing(np.pad(inside, JOIN), _disc(2))[JOIN:-JOIN, JOIN:-JOIN]
+            found[box] |= _fill_small_holes(inside, found.size // 50)
+        return self._to_full(found)
+
+    def _to_full(self, found: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[dict[str, int]]]:
+        w, h = self.size_px
+        full = np.zeros((h, w), bool)
+        blocks = np.kron(found, np.ones((SCALE, SCALE), bool))
+        full[: blocks.shape[0], : blocks.shape[1]] = blocks
+        # What the quarter size left over at the right and at the bottom continues its neighbour.
+        full[:, blocks.shape[1] :] = full[:, blocks.shape[1] - 1 : blocks.shape[1]]
+        full[blocks.shape[0] :] = full[blocks.shape[0] - 1 : blocks.shape[0]]
+        if self.options.dilate_px and full.any():
+            full = ndimage.distance_transform_edt(~full) <= self.options.dilate_px
+        boxes = []
+        for rows, columns in ndimage.find_objects(ndimage.label(full)[0]):
+            x, y = int(columns.start), int(rows.start)
+            boxes.append({"x": x, "y": y, "w": int(columns.stop) - x, "h": int(rows.stop) - y})
+        return full, boxes
+
+
+def _shrink(gray: NDArray[Any]) -> NDArray[np.float32]:
+    """Means of SCALE x SCALE blocks; a remainder at the right and at the bottom is left out."""
+    h, w = gray.shape[0] // SCALE, gray.shape[1] // SCALE
+    # Whole columns first: adding four strided views is three times faster than one reshaped mean.
+    rows = np.zeros((h, w * SCALE), np.float32)
+    for i in range(SCALE):
+        rows += gray[i : h * SCALE : SCALE, : w * SCALE]
+    small = rows[:, 0::SCALE].copy()
+    for i in range(1, SCALE):
+        small += rows[:, i::SCALE]
+    small /= np.float32(SCALE * SCALE)
+    return small
+
+
+def _bars(dark: NDArray[np.float64], n: int) -> tuple[int, int]:
+    """Lengths of the runs from both ends that are dark in 90 % of the looks; 0 below two px or three looks."""
+    if n < 3:
+        return 0, 0
+    bright = np.flatnonzero(dark < 0.9 * n)
+    if len(bright) == 0 or len(bright) < len(dark) // 4:
+        return 0, 0
+    first, last = int(bright[0]), len(dark) - 1 - int(bright[-1])
+    return (first if first >= 2 else 0), (last if last >= 2 else 0)
+
+
+def _between(seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels with seeds on both sides in their row and in their column."""
+
+    def both_sides(a: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
+        before = np.maximum.accumulate(a, axis)
+        after = np.flip(np.maximum.accumulate(np.flip(a, axis), axis), axis)
+        return before & after
+
+    return both_sides(seeds, 0) & both_sides(seeds, 1)
+
+
+def _fill_small_holes(mask: NDArray[np.bool_], largest: int) -> NDArray[np.bool_]:
+    """Fill enclosed holes of up to `largest` pixels: the changing digits of a clock. A ring stays one."""
+    holes, n = ndimage.label(ndimage.binary_fill_holes(mask) & ~mask)
+    if n == 0:
+        return mask
+    sizes = np.bincount(holes.ravel())
+    small = sizes <= largest
+    small[0] = False
+    return mask | small[holes]
+
+
+def _disc(radius: int) -> NDArray[np.bool_]:
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    return x**2 + y**2 <= radius**2
