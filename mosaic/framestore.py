@@ -123,7 +123,9 @@ class FrameStore:
                 side = 2 * self.mask_margin_px + 1
                 kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
                 # Outside the picture counts as usable, or every frame would lose its border.
-                shrunk = cv2.erode(mask.astype(np.uint8) * 255, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=255)
+                shrunk = cv2.erode(
+                    mask.astype(np.uint8) * 255, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=255
+                )
                 self._last_mask = (mask.copy(), np.asarray(shrunk, dtype=np.uint8))
             plane = self._last_mask[1]
         if trust is not None:

@@ -52,7 +52,7 @@ class Pinhole:
     def pixel_to_ray(self, xy):
         d = (np.asarray(xy, dtype=np.float64) - self.centre) / self.f_px
         u = d.copy()
-        for _ in range(60):
+        for _ in range(60 if self.k1 else 0):
             u = d / (1 + self.k1 * (u**2).sum(axis=-1, keepdims=True))
         ray = np.concatenate([u, np.ones_like(u[..., :1])], axis=-1)
         return (ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ self.R

@@ -1,0 +1,281 @@
+"""Which frames to keep for a panorama, and how much each counts where. Placements in, frame numbers and weights out.
+
+A lattice of points lies over the surface. Every point should get K views: of the finest resolution that K views
+reach, seen well inside the frame, little blurred, and as far apart in time as possible, because a player who stands
+in two views at the same place is the same evidence twice. One set of frames serves the whole panorama: with a set
+per tile, views would come and go at tile borders and show there as steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaic.surface import Placement, Surface
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompositeOptions:
+    """views: K, good views wanted at each point (measured: 15 to 25, more buys nothing). tile_px: side of the tiles
+    worked on at a time. finer: zoom ratio from which a sharper view displaces a coarser one. min_span: frames that
+    the K sharpest views of a point must span before coarser ones are left out (2 s at 25 fps: a player has moved).
+    min_gap: frames between views below which one more of the same place is not worth storing.
+    pool: frames kept, as a multiple of K times (panorama area / frame area). margin_px, feather: border of a frame
+    that is not used, and share of its width over which its weight rises. cubic: Catmull-Rom, else linear.
+    floor, cap, doubt: grey levels, see blend.robust_value. max_views: most views of one tile (memory).
+    threads: tiles worked on at once. memory_bytes: an image larger than this lives in a file in the scratch folder.
+    max_candidates: frames looked at when planning; a longer clip is thinned, the least blurred of each group stays.
+    """
+
+    views: int = 17
+    tile_px: int = 512
+    finer: float = 1.3
+    min_span: int = 50
+    min_gap: float = 3.0
+    pool: float = 2.5
+    margin_px: float = 3.0
+    feather: float = 0.06
+    cubic: bool = True
+    floor: float = 3.0
+    cap: float = 10.0
+    doubt: float = 6.0
+    max_views: int = 40
+    threads: int = 2
+    memory_bytes: int = 200_000_000
+    max_candidates: int = 1200
+    gains: bool = True
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.views <= self.max_views <= 255:
+            raise ValueError(
+                f"views {self.views} and max_views {self.max_views}: need 1 <= views <= max_views <= 255"
+            )
+        if self.tile_px < 32 or self.tile_px % 16 or self.threads < 1:
+            raise ValueError(
+                f"tile_px {self.tile_px} must be a multiple of 16 from 32, threads {self.threads} >= 1"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lattice:
+    """Points over a surface: x_px (nx,), y_px (ny,), rays (ny * nx, 3) row by row."""
+
+    x_px: NDArray[np.float64]
+    y_px: NDArray[np.float64]
+    rays: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewPlan:
+    """Frames to store for a panorama, ascending. n_views (ny, nx): good views per lattice point. n_candidates: how
+    many frames were looked at. limit: most frames that this panorama's area allows."""
+
+    frames: tuple[int, ...]
+    n_views: NDArray[np.int32]
+    n_candidates: int
+    limit: int
+
+    def bytes_needed(self, size_px: tuple[int, int]) -> int:
+        """Scratch space for the frames as 8-bit RGB, masks not counted."""
+        return len(self.frames) * size_px[0] * size_px[1] * 3
+
+
+def lattice_of(surface: Surface, n_points: int = 1200) -> Lattice:
+    """About n_points points over the surface, its four corners among them, not closer than 24 px."""
+    spacing = max(24.0, float(np.sqrt(surface.width * surface.height / n_points)))
+    axes = [
+        np.linspace(0, n - 1, max(2, int(np.ceil((n - 1) / spacing)) + 1))
+        for n in (surface.width, surface.height)
+    ]
+    xy = np.stack(np.meshgrid(axes[0], axes[1]), axis=-1).reshape(-1, 2)
+    return Lattice(x_px=axes[0], y_px=axes[1], rays=surface.pixel_to_ray(xy))
+
+
+def resolution(placement: Placement) -> float:
+    """Resolution of a frame in px per radian, lessened by its motion blur."""
+    return float(placement.px_per_rad / np.sqrt(1.0 + placement.blur_px**2))
+
+
+def centrality(xy: NDArray[np.float64], size_px: tuple[int, int], margin_px: float) -> NDArray[np.float32]:
+    """0..1: how well a frame sees points at its pixels xy (..., 2); 0 outside, NaN pixels included.
+
+    Falls towards the sides, because distortion, vignetting and the parallax of a camera whose pupil lies in front
+    of the pan axis all grow there: the views that agree best about a point are those that look at it.
+    """
+    half = (np.array(size_px, dtype=np.float64) - 1) / 2
+    off = np.abs(xy - half) / (half - margin_px)
+    with np.errstate(invalid="ignore"):
+        inside = (off <= 1).all(axis=-1)
+        value = (0.08 + 0.92 * (1 - off[..., 0] ** 2) ** 2) * (1 - 0.5 * off[..., 1] ** 2)
+    return np.where(inside, value, 0.0).astype(np.float32)
+
+
+def resolution_floor(
+    sees: NDArray[np.bool_],
+    fineness: NDArray[np.float64],
+    time: NDArray[np.float64],
+    options: CompositeOptions,
+) -> NDArray[np.float64]:
+    """Per point, the coarsest resolution that still counts as sharp. sees (n, p), fineness and time (n,) -> (p,).
+
+    It is the best over `finer`, or less where fewer than K views, or views of less than min_span frames, reach it.
+    """
+    order = np.argsort(-fineness, kind="stable")
+    seen, ordered, when = sees[order], fineness[order], time[order]
+    floor = np.zeros(sees.shape[1])
+    for point in np.flatnonzero(seen.any(axis=0)):
+        rows = np.flatnonzero(seen[:, point])
+        times = when[rows]
+        span = np.maximum.accumulate(times) - np.minimum.accumulate(times)
+        enough = (np.arange(1, len(rows) + 1) >= options.views) & (span >= min(options.min_span, span[-1]))
+        last = int(np.argmax(enough)) if enough.any() else len(rows) - 1
+        floor[point] = min(ordered[rows[0]] / options.finer, ordered[rows[last]])
+    return floor
+
+
+def choose_frames(
+    quality: NDArray[np.float32],
+    time: NDArray[np.float64],
+    n_views: int,
+    limit: int,
+    *,
+    min_gap: float = 0.0,
+    start: Sequence[int] = (),
+) -> tuple[list[int], NDArray[np.int32]]:
+    """Greedy choice of rows so that every column gets n_views entries, far apart in time.
+
+    quality (n, p), 0 = does not count. Each step takes the row with the largest sum over the columns still short of
+    views, of quality times the square root of the time to the nearest view that the column has (the root: the
+    first seconds matter most, a player seldom stays longer). A column seen for a short while only wants a view per
+    min_gap frames: more of the same moment would fill the store for a strip at the panorama's border. Ends when
+    every column has what it wants, or at `limit` rows. Rows of `start` are taken first. Returns the rows in the
+    order chosen and the count per column.
+    """
+    n, p = quality.shape
+    count = np.zeros(p, np.int32)
+    sees = quality > 0
+    if not sees.any():
+        return [], count
+    first = np.where(sees, time[:, None], np.inf).min(axis=0)
+    last = np.where(sees, time[:, None], -np.inf).max(axis=0)
+    span = np.where(np.isfinite(first), last - first, 0.0)
+    wanted = np.minimum(n_views, sees.sum(axis=0)).astype(np.int32)
+    if min_gap > 0:
+        wanted = np.minimum(wanted, 1 + span // min_gap).astype(np.int32)
+    value = quality.copy()
+    apart = np.full((n, p), np.sqrt(max(float(np.ptp(time)), 1.0)), np.float32)
+    open_columns = np.arange(p)  # the columns of value and apart: finished ones are dropped now and then
+    chosen: list[int] = []
+    given = list(start)
+    while len(chosen) < limit:
+        if given:
+            best = given.pop(0)
+        else:
+            gain = np.einsum("fp,fp->f", value, apart)
+            best = int(np.argmax(gain))
+            if not gain[best] > 0:
+                break
+        chosen.append(best)
+        count[sees[best]] += 1
+        touched = np.flatnonzero(sees[best, open_columns])
+        nearer = np.sqrt(np.abs(time - time[best])).astype(np.float32)
+        apart[:, touched] = np.minimum(apart[:, touched], nearer[:, None])
+        value[best] = 0
+        done = count[open_columns] >= wanted[open_columns]
+        value[:, touched[done[touched]]] = 0
+        if done.sum() > len(open_columns) // 4:
+            keep = ~done
+            open_columns, value, apart = open_columns[keep], value[:, keep].copy(), apart[:, keep].copy()
+    return chosen, count
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rating:
+    """How well n frames see p lattice points. quality (n, p), 0 = does not count. floor (p,): coarsest resolution that
+    counts, px/rad, 0 where nobody looks. rare (n, p): True where a frame is much sharper than the floor, but for so
+    short a moment that coarser frames count beside it."""
+
+    quality: NDArray[np.float32]
+    floor: NDArray[np.float64]
+    rare: NDArray[np.bool_]
+
+
+def rate_views(placements: Sequence[Placement], lattice: Lattice, options: CompositeOptions) -> Rating:
+    """Rate placements at the lattice points: centrality, and no coarser than the resolution floor."""
+    fineness = np.array([resolution(p) for p in placements])
+    time = np.array([p.frame for p in placements], dtype=np.float64)
+    central = np.stack(
+        [centrality(p.ray_to_pixel(lattice.rays), p.size_px, options.margin_px) for p in placements]
+    )
+    sees = central > 0
+    floor = resolution_floor(sees, fineness, time, options)
+    best = np.where(sees, fineness[:, None], 0.0).max(axis=0)
+    enough = sees & (fineness[:, None] >= 0.999 * floor)
+    rare = sees & (fineness[:, None] * options.finer >= best) & (floor < 0.9 * best / options.finer)
+    # Mild: the centre is preferred, but not so much that the views crowd in the moments of one pass.
+    return Rating(
+        quality=np.where(enough, 0.4 + 0.6 * central, 0.0).astype(np.float32), floor=floor, rare=rare
+    )
+
+
+def select_views(
+    rating: Rating, placements: Sequence[Placement], options: CompositeOptions, *, min_gap: float = 0.0
+) -> tuple[list[int], NDArray[np.int32], int]:
+    """Indices of the placements to use, the views per lattice point, and the most that the area allows.
+
+    First a third of K views from short moments of closer zoom, for detail that no other frame has; then K views far
+    apart in time, which say what stands still.
+    """
+    limit = frame_limit(rating.quality, options)
+    time = np.array([p.frame for p in placements], dtype=np.float64)
+    rare = np.where(rating.rare, rating.quality, np.float32(0))
+    sharp, _ = choose_frames(rare, time, -(-options.views // 3), limit, min_gap=min_gap)
+    chosen, count = choose_frames(rating.quality, time, options.views, limit, min_gap=min_gap, start=sharp)
+    return chosen, count, limit
+
+
+def plan_views(
+    placements: Sequence[Placement], surface: Surface, options: CompositeOptions | None = None
+) -> ViewPlan:
+    """Which frames a second pass over the clip has to keep. Cost and result are bounded by the panorama's area.
+
+    placements: approximate ones will do, composite() looks again at the final ones. Raises ValueError when none
+    sees the surface.
+    """
+    options = options or CompositeOptions()
+    candidates = _thin([p for p in placements if np.isfinite(p.px_per_rad)], options.max_candidates)
+    if not candidates:
+        raise ValueError("no placement to plan a panorama for")
+    lattice = lattice_of(surface)
+    rating = rate_views(candidates, lattice, options)
+    chosen, count, limit = select_views(rating, candidates, options, min_gap=options.min_gap)
+    if not chosen:
+        raise ValueError(f"none of {len(candidates)} placements sees the panorama {surface}")
+    return ViewPlan(
+        frames=tuple(sorted(candidates[i].frame for i in chosen)),
+        n_views=count.reshape(len(lattice.y_px), len(lattice.x_px)),
+        n_candidates=len(candidates),
+        limit=limit,
+    )
+
+
+def frame_limit(quality: NDArray[np.float32], options: CompositeOptions) -> int:
+    """Most frames to keep: pool x K x (points seen by anyone / points seen by a frame)."""
+    per_frame = (quality > 0).sum(axis=1)
+    if not per_frame.any():
+        return 0
+    frames_wide = float((quality > 0).any(axis=0).sum() / np.median(per_frame[per_frame > 0]))
+    return int(np.ceil(options.pool * options.views * max(1.0, frames_wide)))
+
+
+def _thin(placements: Sequence[Placement], limit: int) -> list[Placement]:
+    """At most `limit` placements, evenly over time; of each group the least blurred."""
+    ordered = sorted(placements, key=lambda p: p.frame)
+    if len(ordered) <= limit:
+        return ordered
+    cuts = np.linspace(0, len(ordered), limit + 1).astype(int)
+    return [min(ordered[a:b], key=lambda p: p.blur_px) for a, b in pairwise(cuts)]
