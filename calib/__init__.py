@@ -5,6 +5,7 @@ judge() says whether the focal length may be published, RunningCalibrator does i
 """
 
 from calib.gates import GateOptions, judge
+from calib.poses import PoseOptions, solve_poses
 from calib.records import (
     HomographyEdge,
     HomographyGraph,
@@ -16,18 +17,24 @@ from calib.records import (
     Verdict,
 )
 from calib.refine import RefineOptions, refine
+from calib.running import CameraEstimate, RunningCalibrator, RunningOptions
 
 __all__ = [
+    "CameraEstimate",
     "GateOptions",
     "HomographyEdge",
     "HomographyGraph",
     "KnownFocal",
     "Lens",
     "Level",
+    "PoseOptions",
     "Priors",
     "RefineOptions",
+    "RunningCalibrator",
+    "RunningOptions",
     "Solution",
     "Verdict",
     "judge",
     "refine",
+    "solve_poses",
 ]

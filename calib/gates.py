@@ -7,7 +7,7 @@ Sources: calibration.md 7; real-footage.md 6.5 to 6.8, whose limits are in px at
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,7 @@ class GateOptions:
     row_share: float = 0.03
     min_rotation_w: float = 0.02
     refits: bool = True
-    refine: RefineOptions = RefineOptions()
+    refine: RefineOptions = field(default_factory=RefineOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
