@@ -190,7 +190,10 @@ def flat(value: Any, prefix: str = "", percent: tuple[str, ...] = ()) -> Iterato
         for key, inner in value.items():
             yield from flat(inner, f"{prefix}.{key}" if prefix else str(key), percent)
         return
-    in_percent = any(part.startswith(name) for part in prefix.split(".") for name in percent)
+    # A part of an error budget that is named in px (calib's systematic_px) is not a share.
+    in_percent = not prefix.endswith("_px") and any(
+        part.startswith(name) for part in prefix.split(".") for name in percent
+    )
     yield prefix, text_of(value, in_percent=in_percent)
 
 

@@ -54,6 +54,29 @@ REASONS = {
     "few_inliers": ("most of the picture moves against the background", "a wider view with fewer players"),
     "duplicate": ("the picture repeats the one before", ""),
     "tracking_lost": ("the thread to the earlier pictures broke", "a clip without interruption"),
+    "not_linked": (
+        "the picture could not be linked to the rest of the shot",
+        "a slower pan or less motion blur",
+    ),
+    "bridged": ("the picture's own alignment failed; its camera lies between its neighbours'", ""),
+    "focal_error_above_5_percent": ("the focal length is known, but only to worse than 5 %", PAN),
+    "too_few_edges": (
+        "fewer than two pictures could be linked",
+        "a longer shot, or a view with more structure",
+    ),
+    "not_converged": ("the calibration reached no optimum", f"a longer or wider pan, or {PRIOR}"),
+    "distortion_not_modelled": (
+        "the lens distortion was held fixed without being known, which biases the focal length",
+        "a distortion that may vary, or a known lens as a prior",
+    ),
+    "distortion_invalid": (
+        "the lens distortion that fits folds the picture over itself",
+        "a known lens as a prior",
+    ),
+    "band_only": (
+        "structure was found in a narrow band of the picture only, which gives wrong focal lengths",
+        f"a view with structure from top to bottom, or {PRIOR}",
+    ),
     "not_observable": ("this motion does not show the focal length", PAN),
     "focal_unobservable": ("this motion does not show the focal length", PAN),
     "no_rotation": ("the camera stands still", f"a shot that pans, or {PRIOR}"),

@@ -89,7 +89,8 @@ def fake_run(
         sentence="", focal={"min_f_px": 2755.0, "max_f_px": 4650.0},
         calibration={
             "sigma_log_f_total": 0.0192,
-            "sigma_parts": {"statistical": 0.003, "principal_point": 0.011, "distortion": 0.0153},
+            "sigma_parts": {"statistical": 0.003, "principal_point": 0.011, "distortion": 0.0153,
+                            "systematic_px": 0.21},
             "s10_px": 0.87, "chi2_dof": 2.61, "n_keyframes": 14, "n_edges": 61,
             "lens": {"k1_half": 0.021, "pp_px": [642.1, 351.8]}, "level": None, "flags": ["inflated"],
         },

@@ -96,7 +96,8 @@ def test_each_status_of_the_run_is_named_signed_and_patterned(tmp_path: Path) ->
 def test_calibration_verdict_timings_and_configuration_are_stated(tmp_path: Path) -> None:
     table = fake_table()
     text = build(tmp_path, fake_run(table), table).text
-    for fact in ("1.92 %", "1.53 %", "0.87", "2.61", "No focal length is claimed", "gates.chi2_dof_max 6",
+    for fact in ("1.92 %", "1.53 %", "sigma_parts.systematic_px 0.21 ", "0.87", "2.61",
+                 "No focal length is claimed", "gates.chi2_dof_max 6",
                  "gates.known_focal not known", "11.70 s", "equirectangular", "2.13.0"):  # fmt: skip
         assert fact in text, fact
 
