@@ -282,7 +282,7 @@ def write_run(path: Path, record: RunRecord) -> None:
 def read_run(path: str | Path) -> RunRecord:
     """run.json, or the folder that holds it, as a record. Raises InputError: none there, damaged, another format."""
     path = Path(path)
-    path = path / "run.json" if path.is_dir() else path
+    path = path if path.suffix == ".json" and not path.is_dir() else path / "run.json"
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
