@@ -54,11 +54,12 @@ def transfer(
     width_px: float,
     *,
     jacobian: bool = True,
+    pose_only: bool = False,
 ) -> Transfer:
     """Raw points of a, (..., m), seen in b.
 
     log_f_a, log_f_b: (...,); R_b_a (..., 3, 3); shared (..., 5) = pp_x, pp_y, log aspect, c0, c1. The Jacobian's
-    columns: log f_a, left increment of R_a (3), log f_b, left increment of R_b (3), then the shared five.
+    columns: log f_a, left increment of R_a (3), log f_b, left increment of R_b (3), then (not pose_only) the shared five.
     """
     s2 = (width_px / 2) ** 2
     ppx, ppy, log_aspect, c0, c1 = (shared[..., k, None] for k in range(5))
@@ -94,15 +95,16 @@ def transfer(
     ai, bi = alpha_b * inv, beta_b * inv
     G11, G12, G21, G22 = d11 * ai, d12 * bi, d12 * ai, d22 * bi
     G13, G23 = -(G11 * q1 + G12 * q2), -(G21 * q1 + G22 * q2)
-    J = np.empty((*out_x.shape[:-1], N_COLUMNS, 2, out_x.shape[-1]))
+    J = np.empty((*out_x.shape[:-1], 8 if pose_only else N_COLUMNS, 2, out_x.shape[-1]))
     ra = rho * rho
     slope_a = 1 + 3 * ka * ra
-    # D_a^-1 = (1/g_a)(I - (slope - g_a)/slope n n^T): eigenvalue 1/slope along the radius, 1/g_a across.
-    ga_inv = 1.0 / (1 + ka * ra)
-    ux, uy = dx * shrink, dy * shrink
-    ratio = 2 * ka / s2 / slope_a
-    i11, i12, i22 = ga_inv * (1 - ratio * ux * ux), -ga_inv * ratio * ux * uy, ga_inv * (1 - ratio * uy * uy)
     radial_a = ra / slope_a
+    # D_a^-1 = (1/g_a)(I - (slope - g_a)/slope n n^T): eigenvalue 1/slope along the radius, 1/g_a across.
+    if not pose_only:
+        ga_inv = 1.0 / (1 + ka * ra)
+        ux, uy = dx * shrink, dy * shrink
+        ratio = 2 * ka / s2 / slope_a
+        i11, i12, i22 = ga_inv * (1 - ratio * ux * ux), -ga_inv * ratio * ux * uy, ga_inv * (1 - ratio * uy * uy)
     for row, (a, b, c) in enumerate(((G11, G12, G13), (G21, G22, G23))):
         x = a * R[..., 0, 0, :] + b * R[..., 1, 0, :] + c * R[..., 2, 0, :]
         y = a * R[..., 0, 1, :] + b * R[..., 1, 1, :] + c * R[..., 2, 1, :]
@@ -119,6 +121,8 @@ def transfer(
         J[..., 5, row, :] = c * w2 - b * w3
         J[..., 6, row, :] = a * w3 - c * w1
         J[..., 7, row, :] = b * w1 - a * w2
+        if pose_only:
+            continue
         au, av = x / alpha_a, y / beta_a
         J[..., 8, row, :] = (1.0 if row == 0 else 0.0) - (au * i11 + av * i12)
         J[..., 9, row, :] = (0.0 if row == 0 else 1.0) - (au * i12 + av * i22)

@@ -109,7 +109,7 @@ def _iterate(
     packed: Packed, system: _PoseSystem, state: State, loss: Loss, options: PoseOptions
 ) -> tuple[State, float, bool, int, sp.csc_array | None]:
     """Levenberg-Marquardt on the free frames: state, cost, converged, steps, undamped matrix at the end."""
-    lin = linearise(packed, state, loss)
+    lin = linearise(packed, state, loss, pose_only=True)
     cost, damping, shared = float(lin.cost[0]), 1e-6, np.zeros((1, 5))
     if not np.isfinite(cost):
         return state, cost, False, 0, None
@@ -130,7 +130,7 @@ def _iterate(
         full = np.zeros((1, packed.n_frames, 4))
         full[0, system.free] = step
         trial = state.moved(full, shared)
-        new = linearise(packed, trial, loss)
+        new = linearise(packed, trial, loss, pose_only=True)
         if float(new.cost[0]) <= cost:
             change = (cost - float(new.cost[0])) / max(cost, 1e-300)
             state, lin, cost = trial, new, float(new.cost[0])

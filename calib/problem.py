@@ -151,7 +151,7 @@ class Linearised:
     e2: Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass
 class Loss:
     """Robust loss over points: 'huber' or 'tukey' with thresholds in units of scale (S,) times the stated sigma."""
 
@@ -181,13 +181,16 @@ def _chunks(n_edges: int, n_starts: int, m: int) -> list[slice]:
     return [slice(k, min(k + size, n_edges)) for k in range(0, n_edges, size)]
 
 
-def residuals(packed: Packed, state: State, which: slice = slice(None), *, jacobian: bool = False) -> tuple[Array, ...]:
+def residuals(
+    packed: Packed, state: State, which: slice = slice(None), *, jacobian: bool = False, pose_only: bool = False
+) -> tuple[Array, Array, Array]:
     """Raw residuals r_x, r_y (S, E, m) px of measured minus predicted, and the Jacobian of the prediction or None."""
     ia, ib = packed.ia[which], packed.ib[which]
     Ra, Rb = state.R[:, ia], state.R[:, ib]
     out = camera.transfer(
         packed.a_x[which], packed.a_y[which], state.log_f[:, ia], state.log_f[:, ib],
-        Rb @ np.swapaxes(Ra, -1, -2), state.shared[:, None], packed.size_px[0], jacobian=jacobian,
+        Rb @ np.swapaxes(Ra, -1, -2), state.shared[:, None], packed.size_px[0],
+        jacobian=jacobian, pose_only=pose_only,
     )  # fmt: skip
     return packed.b_x[which] - out.x, packed.b_y[which] - out.y, out.J  # type: ignore[return-value]
 
@@ -204,14 +207,27 @@ def whitened_squares(packed: Packed, state: State) -> Array:
     return out
 
 
-def linearise(packed: Packed, state: State, loss: Loss) -> Linearised:
-    """Cost, normal blocks and gradients per edge at a state."""
+class AdaptiveLoss(Loss):
+    """Huber with the scale that the residuals have at the moment: for the first steps of a small problem."""
+
+    def __init__(self, dof: Array, huber: float) -> None:
+        super().__init__("huber", np.ones(1), huber)
+        self.dof = dof
+
+    def value_and_weight(self, e2: Array) -> tuple[Array, Array]:
+        """As Loss, at the residuals' own scale."""
+        return Loss("huber", robust_scale(e2, self.dof), self.huber).value_and_weight(e2)
+
+
+def linearise(packed: Packed, state: State, loss: Loss, *, pose_only: bool = False) -> Linearised:
+    """Cost, normal blocks and gradients per edge at a state; pose_only leaves the shared columns out (8 x 8 blocks)."""
     S, E, m = len(state.log_f), packed.n_edges, packed.dof.shape[1]
-    blocks, gradient = np.empty((S, E, 13, 13)), np.empty((S, E, 13))
+    n_columns = 8 if pose_only else 13
+    blocks, gradient = np.empty((S, E, n_columns, n_columns)), np.empty((S, E, n_columns))
     e2_all, cost = np.empty((S, E, m)), np.zeros(S)
     with np.errstate(all="ignore"):
         for part in _chunks(E, S, m):
-            rx, ry, J = residuals(packed, state, part, jacobian=True)
+            rx, ry, J = residuals(packed, state, part, jacobian=True, pose_only=pose_only)
             s11, s12, s22 = packed.s11[part], packed.s12[part], packed.s22[part]
             known = packed.dof[part] > 0
             ex, ey = s11 * rx + s12 * ry, s12 * rx + s22 * ry
@@ -226,7 +242,7 @@ def linearise(packed: Packed, state: State, loss: Loss) -> Linearised:
             Jw[..., 0, :] += J[..., 1, :] * w12[..., None, :]
             np.multiply(J[..., 1, :], w22[..., None, :], out=Jw[..., 1, :])
             Jw[..., 1, :] += J[..., 0, :] * w12[..., None, :]
-            Jw = Jw.reshape(S, -1, 13, 2 * m)
+            Jw = Jw.reshape(S, -1, n_columns, 2 * m)
             blocks[:, part] = Jw @ np.swapaxes(Jw, -1, -2)
             gradient[:, part] = (Jw @ e)[..., 0]
             e2_all[:, part] = e2

@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 
 from calib import rotation, serial
 from calib.gates import GateOptions, coherent_px
-from calib.problem import Loss, State, linearise, pack, robust_scale
+from calib.problem import AdaptiveLoss, Linearised, Packed, State, linearise, pack, robust_scale
 from calib.records import HomographyEdge, HomographyGraph, Lens, Priors, Solution
 from calib.refine import RefineOptions, refine, state_from_solution
 
 Array = NDArray[np.float64]
+
+MAX_POSE_STEPS = 15
+FAR_SCALE = 100.0  # robust residual scale, in stated sigmas (10 px), from which a guess is not worth refining
 
 SENTENCES = {
     "ok": "The focal length is known with the stated error.",
@@ -259,8 +262,8 @@ class RunningCalibrator:
         solved = self._solve(frame, known)
         if solved is None:
             return self._lost(frame, "diverged")
-        pose, own = solved
-        self._measure_velocity(frame, known, pose)
+        pose, own, alone = solved
+        self._measure_velocity(frame, pose, alone)
         self._remember(frame, pose)
         status = "ok" if self.ready else "relative"
         return self._estimate(frame, pose, status, "ok" if self.ready else "not_ready", own)
@@ -270,7 +273,7 @@ class RunningCalibrator:
         mine = [(e, e.b if e.a == frame else e.a) for e in edges if frame in (e.a, e.b)]
         return [e for e, other in mine if other in self._poses or other in self._recent]
 
-    def _solve(self, frame: int, edges: Sequence[HomographyEdge]) -> tuple[_Pose, float] | None:
+    def _solve(self, frame: int, edges: Sequence[HomographyEdge]) -> tuple[_Pose, float, _Pose | None] | None:
         others = sorted({e.b if e.a == frame else e.a for e in edges})
         graph = HomographyGraph(frames=np.array([*others, frame]), edges=tuple(edges), size_px=self.size_px)
         packed = pack(graph)
@@ -278,46 +281,48 @@ class RunningCalibrator:
             return None
         lens = self.lens
         poses = [self._poses.get(f) or self._recent[f] for f in others]
-        guess = self._guess(frame, edges, packed, graph)
-        if guess is None:
-            return None
-        log_f = np.array([[*(p.log_f for p in poses), guess.log_f]])
-        R = np.array([[*(p.R for p in poses), guess.R]])
-        state = State(log_f, R, np.array([[*lens.pp_px, math.log(lens.aspect), lens.c0, lens.c1]]))
+        shared = np.array([[*lens.pp_px, math.log(lens.aspect), lens.c0, lens.c1]])
         row = len(others)
         first = packed.ia == row
-        loss = Loss("huber", np.array([1e6]))
-        damping, best, normal = 1e-6, math.inf, np.eye(4)
-        lin = linearise(packed, state, loss)
-        if not np.isfinite(lin.cost[0]):
+        loss = AdaptiveLoss(packed.dof, self.options.refine.huber)
+
+        def look_at(guess: _Pose | None) -> tuple[State, Linearised] | None:
+            if guess is None:
+                return None
+            log_f = np.array([[*(p.log_f for p in poses), guess.log_f]])
+            state = State(log_f, np.array([[*(p.R for p in poses), guess.R]]), shared)
+            lin = linearise(packed, state, loss, pose_only=True)
+            return (state, lin) if np.isfinite(lin.cost[0]) else None
+
+        # The constant-velocity guess is a few px off; where it is not, chain along the measured homographies.
+        found = look_at(self._extrapolated(frame))
+        if found is None or robust_scale(found[1].e2, packed.dof)[0] > FAR_SCALE:
+            found = look_at(self._chained(packed, graph)) or found
+        if found is None:
             return None
-        for look in range(12):
-            if look <= 2:
-                # Scale from what is seen now; fixed from the third pass on so that the cost is one function.
-                loss = Loss("huber", robust_scale(lin.e2, packed.dof), self.options.refine.huber)
-                lin = linearise(packed, state, loss) if look == 0 else lin
-                best = math.inf
+        state, lin = found
+        normal, settled = np.eye(4), False
+        for _ in range(MAX_POSE_STEPS):
             blocks, gradient = lin.blocks[0], lin.gradient[0]
             normal = np.where(first[:, None, None], blocks[:, 0:4, 0:4], blocks[:, 4:8, 4:8]).sum(0)
             right = np.where(first[:, None], gradient[:, 0:4], gradient[:, 4:8]).sum(0)
             try:
-                step = np.linalg.solve(normal + damping * np.diag(np.diagonal(normal)), right)
+                step = np.linalg.solve(normal, right)
             except np.linalg.LinAlgError:
                 return None
+            # Newton decrement: a step of a tenth of its standard deviation is taken and not looked at again.
+            settled = float(step @ right) < 1e-2
             step = step / max(1.0, abs(step[0]) / 0.3, float(np.abs(step[1:]).max()) / 0.2)
             move = np.zeros((1, row + 1, 4))
             move[0, row] = step
-            trial = state.moved(move, np.zeros((1, 5)))
-            new = linearise(packed, trial, loss)
-            if new.cost[0] <= best:
-                best, state, lin, damping = float(new.cost[0]), trial, new, max(damping * 0.1, 1e-9)
-            else:
-                damping = max(damping, 1e-6) * 100
-                if not damping < 1e6:
-                    break
-            # Newton decrement: the step in its own standard deviations.
-            if look >= 1 and float(step @ right) < 1e-4 * float(loss.scale[0]) ** 2:
+            state = state.moved(move, np.zeros((1, 5)))
+            if settled:
                 break
+            lin = linearise(packed, state, loss, pose_only=True)
+            if not np.isfinite(lin.cost[0]):
+                return None
+        if not settled:
+            return None
         scale = float(robust_scale(lin.e2, packed.dof)[0])
         if scale > self.options.max_scale:
             return None
@@ -325,11 +330,35 @@ class RunningCalibrator:
             own = math.sqrt(max(float(np.linalg.inv(normal)[0, 0]), 0.0)) * scale
         except np.linalg.LinAlgError:
             return None
-        return _Pose(float(state.log_f[0, row]), state.R[0, row], tuple(others)), own
+        alone = self._direct_pose(frame, edges, state, row, lin)
+        return _Pose(float(state.log_f[0, row]), state.R[0, row], tuple(others)), own, alone
 
-    def _guess(self, frame: int, edges: Sequence[HomographyEdge], packed: Any, graph: HomographyGraph) -> _Pose | None:
+    def _direct_pose(
+        self, frame: int, edges: Sequence[HomographyEdge], state: State, row: int, lin: Linearised
+    ) -> _Pose | None:
+        """Pose by the edge to the previous frame alone: one Gauss-Newton step from the full one (they differ by < 1 px)."""
+        which = [k for k, e in enumerate(edges) if {e.a, e.b} == {self._last, frame}]
+        if not which:
+            return None
+        k = which[0]
+        part = slice(0, 4) if edges[k].a == frame else slice(4, 8)
+        try:
+            step = np.linalg.solve(lin.blocks[0, k][part, part], lin.gradient[0, k][part])
+        except np.linalg.LinAlgError:
+            return None
+        if abs(step[0]) > 0.1 or np.abs(step[1:]).max() > 0.05:
+            return None
+        return _Pose(float(state.log_f[0, row] + step[0]), rotation.exp(step[1:]) @ state.R[0, row])
+
+    def _extrapolated(self, frame: int) -> _Pose | None:
         if frame in self._recent:
             return self._recent[frame]
+        if self._last is None or self._last not in self._recent:
+            return None
+        predicted = self.predict(frame)
+        return _Pose(predicted.log_f, predicted.R)
+
+    def _chained(self, packed: Packed, graph: HomographyGraph) -> _Pose | None:
         others = [int(f) for f in graph.frames[:-1]]
         state = state_from_solution(packed, graph.frames, self._known(others), 0)
         back = (self._poses.get(others[0]) or self._recent[others[0]]).R
@@ -361,22 +390,19 @@ class RunningCalibrator:
         self._recent = {key: self._poses[key], frame: _Pose(float(solution.log_f[1]), solution.R[1])}
 
     # ------------------------------------------------------------------ motion
-    def _measure_velocity(self, frame: int, edges: Sequence[HomographyEdge], pose: _Pose) -> None:
+    def _measure_velocity(self, frame: int, pose: _Pose, alone: _Pose | None) -> None:
         """Velocity a frame from the frame-to-frame edge alone; a keyframe's correction is no motion."""
         last = self._last
         if last is None or last == frame or last not in self._recent:
             return
         dt, before = frame - last, self._recent[last]
-        direct = [e for e in edges if {e.a, e.b} == {last, frame}]
-        if direct and len(direct) < len(edges):
-            alone = self._solve(frame, direct)
-            if alone is None:
+        if alone is None:
+            # Two poses against the same keyframes carry the same correction, which cancels.
+            if not pose.anchors or pose.anchors != before.anchors:
                 return
-            pose = alone[0]
-        elif not direct and pose.anchors != before.anchors:
-            return
-        turn = rotation.log(pose.R @ before.R.T) / dt
-        self._velocity = ((pose.log_f - before.log_f) / dt, turn)
+            alone = pose
+        turn = rotation.log(alone.R @ before.R.T) / dt
+        self._velocity = ((alone.log_f - before.log_f) / dt, turn)
 
     def predict(self, frame: int) -> CameraEstimate:
         """Constant velocity from the last frame with a measured camera; status 'predicted', errors of that frame."""
