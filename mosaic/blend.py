@@ -208,24 +208,25 @@ def _sort(rows, network):  # type: ignore[no-untyped-def]
             b[p] = y if x < y else x
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _weighted_median(values, weights, n):  # type: ignore[no-untyped-def]
-    """Sorts both in place; the value at which half of the weight is reached."""
-    total = np.float32(0)
+    """The smallest value v such that values <= v hold half of the weight, by halving 0..255 eight times: sums
+    without branches, where an insertion sort of 20 values costs four times as much."""
+    half = np.float32(0)
     for i in range(n):
-        total += weights[i]
-        v, w = values[i], weights[i]
-        j = i - 1
-        while j >= 0 and values[j] > v:
-            values[j + 1], weights[j + 1] = values[j], weights[j]
-            j -= 1
-        values[j + 1], weights[j + 1] = v, w
-    reached = np.float32(0)
-    for i in range(n):
-        reached += weights[i]
-        if 2 * reached >= total:
-            return values[i]
-    return values[n - 1]
+        half += weights[i]
+    half *= np.float32(0.5)
+    low, high = np.int32(0), np.int32(255)
+    while low < high:
+        middle = (low + high) >> 1
+        below = np.float32(0)
+        for i in range(n):
+            below += weights[i] if values[i] <= middle else np.float32(0)
+        if below >= half:
+            high = middle
+        else:
+            low = middle + 1
+    return low
 
 
 @numba.njit(cache=True, nogil=True)
@@ -239,7 +240,7 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
        view is only half trusted: a weighted median instead, because then it matters which views saw it best
        (parallax, a player who stands in many of them). Votes are the root of the weight, times the root of the trust
        that the weight already holds once: weights as they are let a few views decide, and a player in those is kept.
-       It costs 30 times the plain one, hence only there;
+       It costs 10 times the plain one, hence only there;
     4. weighted mean of the views within 2 min(spread, cap) + floor of the median; the nearest view if none is.
     One view: taken. Two: the heavier one is the centre. Out: out (N, 3), n_seen (N,), spread (N,), uint8.
     """
@@ -251,8 +252,8 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
     partial = np.empty(_BLOCK, np.uint8)
     median = np.empty(_BLOCK, np.uint8)
     total = np.empty((4, _BLOCK), np.float32)
-    values = np.empty(n, np.uint8)
-    weights = np.empty(n, np.float32)
+    values = np.empty(n, np.int32)
+    votes = np.empty(n, np.float32)
     half = n // 2
     first_pad = np.uint8(
         n % 2
@@ -321,15 +322,12 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
                 for c in range(3):
                     centre[c, p] = stack[best, c, at]
             else:
+                for k in range(n):
+                    votes[k] = np.sqrt(np.float32(weight[k, at]) * np.float32(trust[k, at]))
                 for c in range(3):
-                    m = 0
                     for k in range(n):
-                        if trust[k, at] > 0:
-                            values[m] = stack[k, c, at]
-                            weights[m] = np.sqrt(np.float32(weight[k, at]) * np.float32(trust[k, at]))
-                            m += 1
-                    centre[c, p] = _weighted_median(values, weights, m)
-            m = 0
+                        values[k] = stack[k, c, at]
+                    centre[c, p] = _weighted_median(values, votes, n)
             for k in range(n):
                 d = (
                     abs(np.int16(stack[k, 0, at]) - np.int16(centre[0, p]))
@@ -337,12 +335,9 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
                     + abs(np.int16(stack[k, 2, at]) - np.int16(centre[2, p]))
                 )
                 apart[k, p] = np.uint8((d + 2) >> 2)
-                if trust[k, at] > 0:
-                    values[m] = apart[k, p]
-                    weights[m] = np.sqrt(np.float32(weight[k, at]) * np.float32(trust[k, at]))
-                    m += 1
+                values[k] = apart[k, p]
             if count > 2:
-                median[p] = _weighted_median(values, weights, m)
+                median[p] = _weighted_median(values, votes, n)
             else:
                 # Two views have no spread of their own: they count as one place when they differ by noise only.
                 median[p] = 0

@@ -28,6 +28,7 @@ from mosaic.views import (
     Rating,
     ViewPlan,
     centrality,
+    crowd_level,
     lattice_of,
     plan_views,
     rate_views,
@@ -125,6 +126,7 @@ class _Scene:
     lattice: Lattice
     quality: NDArray[np.float32]  # (n, ny, nx)
     floor: NDArray[np.float64]  # (ny, nx)
+    crowd: NDArray[np.float32]  # (ny, nx)
     options: CompositeOptions
 
 
@@ -157,7 +159,8 @@ def composite(
     grid_shape = (len(lattice.y_px), len(lattice.x_px))
     scene = _Scene(
         surface=surface, store=store, views=views, gains=gains.astype(np.float32), lattice=lattice,
-        quality=rating.quality.reshape(-1, *grid_shape), floor=rating.floor.reshape(grid_shape), options=options,
+        quality=rating.quality.reshape(-1, *grid_shape), floor=rating.floor.reshape(grid_shape),
+        crowd=crowd_level(views, lattice, rating.floor, options).reshape(grid_shape), options=options,
     )  # fmt: skip
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     size = (surface.height, surface.width)
@@ -240,7 +243,7 @@ def _tile_maps(
     near = _lattice_box(scene.lattice, x0, y0, width, height)
     candidates = np.flatnonzero(scene.quality[(slice(None), *near)].any(axis=(1, 2)))
     rays, checks = _tile_rays(scene.surface, x0, y0, width, height, GRID_PX)
-    floor = _interpolate(scene, rays.shape[:2], x0, y0)
+    floor, crowd = _interpolate(scene, rays.shape[:2], x0, y0)
     found = []
     for index in candidates:
         placement = scene.views[index]
@@ -253,9 +256,10 @@ def _tile_maps(
                 xy = placement.ray_to_pixel(finer)
                 if _grid_error(xy, placement.ray_to_pixel(finer_checks)) <= MAP_ERROR_PX:
                     break
-        level = floor if step == GRID_PX else _interpolate(scene, xy.shape[:2], x0, y0, step)
+        level, least = (floor, crowd) if step == GRID_PX else _interpolate(scene, xy.shape[:2], x0, y0, step)
         central = centrality(xy, placement.size_px, scene.options.margin_px)
-        sharp = _sharpness(resolution(placement), level)
+        crowded = np.clip((central / np.maximum(least, 1e-6) - 0.7) / 0.3, 0.0, 1.0)
+        sharp = _sharpness(resolution(placement), level) * np.where(least > 0, crowded, 1.0)
         if not (central * sharp).any():
             continue
         shrink = _shrink(xy, step)
@@ -322,14 +326,14 @@ def _lattice_box(lattice: Lattice, x0: int, y0: int, width: int, height: int) ->
 
 def _interpolate(
     scene: _Scene, shape: tuple[int, int], x0: int, y0: int, step: int = GRID_PX
-) -> NDArray[np.float64]:
-    """The resolution floor at the points of a tile's grid, bilinear; points that nobody sees do not pull it down."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Resolution floor and crowd level at the points of a tile's grid, bilinear; points that nobody sees do not pull
+    the floor down."""
     rows = (y0 + step * np.arange(shape[0])) / max(scene.lattice.y_px[1], 1e-9)
     columns = (x0 + step * np.arange(shape[1])) / max(scene.lattice.x_px[1], 1e-9)
-    known = scene.floor > 0
-    value = _bilinear(np.where(known, scene.floor, 0.0), rows, columns)
-    share = _bilinear(known.astype(np.float64), rows, columns)
-    return np.where(share > 0, value / np.maximum(share, 1e-9), 0.0)
+    share = _bilinear((scene.floor > 0).astype(np.float64), rows, columns)
+    floor = np.where(share > 0, _bilinear(scene.floor, rows, columns) / np.maximum(share, 1e-9), 0.0)
+    return floor, _bilinear(scene.crowd.astype(np.float64), rows, columns)
 
 
 def _bilinear(

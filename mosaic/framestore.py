@@ -47,7 +47,7 @@ class FrameStore:
         folder: str | os.PathLike[str],
         size_px: tuple[int, int],
         *,
-        cache_bytes: int = 160_000_000,
+        cache_bytes: int = 200_000_000,
         mask_margin_px: int = 3,
     ) -> None:
         self.size_px = (int(size_px[0]), int(size_px[1]))

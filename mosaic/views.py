@@ -32,6 +32,7 @@ class CompositeOptions:
     """
 
     views: int = 17
+    crowd: float = 1.2
     tile_px: int = 512
     finer: float = 1.3
     min_span: int = 50
@@ -236,6 +237,25 @@ def select_views(
     sharp, _ = choose_frames(rare, time, -(-options.views // 3), limit, min_gap=min_gap)
     chosen, count = choose_frames(rating.quality, time, options.views, limit, min_gap=min_gap, start=sharp)
     return chosen, count, limit
+
+
+def crowd_level(
+    views: Sequence[Placement], lattice: Lattice, floor: NDArray[np.float64], options: CompositeOptions
+) -> NDArray[np.float32]:
+    """Per lattice point, the centrality that crowd x K of the views reach; 0 where fewer look at it.
+
+    One set of frames for the whole panorama gives some points twice the views that they need. Fading out those
+    below this level saves their warping and leaves views that agree better; the level varies smoothly, so no step.
+    """
+    n = max(1, round(options.crowd * options.views))
+    if len(views) <= n:
+        return np.zeros(len(lattice.rays), np.float32)
+    fine = np.array([resolution(p) for p in views])[:, None] >= 0.999 * floor
+    central = (
+        np.stack([centrality(p.ray_to_pixel(lattice.rays), p.size_px, options.margin_px) for p in views])
+        * fine
+    )
+    return np.partition(central, len(views) - n, axis=0)[len(views) - n].astype(np.float32)
 
 
 def plan_views(
