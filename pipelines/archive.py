@@ -229,8 +229,11 @@ def write_table_arrays(path: Path, table: CameraTable) -> None:
 def read_table_arrays(path: Path) -> CameraTable:
     """Inverse of `write_table_arrays`."""
     with np.load(path, allow_pickle=False) as stored:
-        columns = {f.name: stored[f.name] for f in fields(CameraTable)}
-    return CameraTable(**{k: tuple(v.tolist()) if v.dtype.kind == "U" else v for k, v in columns.items()})
+        columns: dict[str, Any] = {f.name: stored[f.name] for f in fields(CameraTable)}
+    for name, values in columns.items():
+        if values.dtype.kind == "U":
+            columns[name] = tuple(values.tolist())
+    return CameraTable(**columns)
 
 
 # ---- run.json

@@ -35,7 +35,7 @@ COLUMNS: tuple[tuple[str, str, str, str], ...] = (
     ("inside_2_sigma", "in 2 s %", "%", "... within two"),
     ("zoom_rms", "zoom rms %", "%", "rms of log(zoom ratio / true ratio), to the reference frame"),
     ("zoom_max", "zoom max %", "%", "largest of it"),
-    ("corner_px", "corner px", ".2f", "rms of frame corners sent to the reference frame and truly back; undistorted px"),
+    ("corner_px", "corner px", ".2f", "rms of corners sent to the reference frame and truly back; undistorted px"),
     ("corner_in_reference_px", "in ref px", ".2f", "the same error measured in the plane of the reference frame"),
     ("transfer_px", "raw px", ".2f", "rms of frame points, through either lens, that the reference frame sees too"),
     ("pan_rms_deg", "pan deg", ".3f", "rms pan error"),

@@ -1,0 +1,380 @@
+"""The command line: run, demo, probe, compare. Exit codes, one-line errors, progress and logging live here only.
+
+Nothing heavy is imported before a command needs it: --help answers without torch, cv2, scipy, av or numpy.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.errors import (
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    EXIT_SHOTS_FAILED,
+    EXIT_USAGE,
+    InputError,
+    UserError,
+)
+
+if TYPE_CHECKING:
+    from pipelines.config import Config
+
+log = logging.getLogger(__name__)
+
+app = typer.Typer(
+    name="broadcast-mosaic",
+    help="A calibrated camera and a clean panorama from a sports broadcast clip.",
+    epilog="Exit codes: 0 all done, 1 some shots failed, 2 wrong usage or unusable input, 130 interrupted.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+# The base class of usage errors; typer brings its own copy of click in some versions and not in others.
+_UsageProblem: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+Clips = Annotated[
+    list[Path], typer.Argument(help="Video file, folder of images, or pattern like frames/%06d.png.")
+]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the results; made if it is not there.")]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="Settings: a TOML file, or run.json of an earlier run.")
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep the shots that an interrupted run finished.")]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, errors too.")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="No progress, no table; errors only.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say what is going on, on stderr.")]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code. A user's mistake is one line on stderr, a bug keeps its traceback."""
+    given = list(sys.argv[1:] if args is None else args)
+    plain, dotted = _split_settings(given)
+    as_json = "--json" in plain
+    try:
+        code = app(args=plain, prog_name="broadcast-mosaic", standalone_mode=False, obj=dotted)
+    except UserError as error:
+        return _fail(str(error), error.as_dict(), as_json)
+    except _UsageProblem as error:
+        message = error.format_message() if hasattr(error, "format_message") else str(error)
+        if message:  # empty: help was asked for by giving nothing, and has been shown
+            one_line = " ".join(message.split())
+            cure = "see broadcast-mosaic --help"
+            return _fail(
+                f"{one_line} {cure}",
+                {"kind": "usage", "what": "arguments", "cause": one_line, "cure": cure},
+                as_json,
+            )
+        return EXIT_USAGE
+    except (KeyboardInterrupt, typer.Abort):
+        code = EXIT_INTERRUPTED
+    if code == EXIT_INTERRUPTED:
+        cure = "--resume goes on with the shots that are done"
+        what = {"kind": "interrupted", "what": "run", "cause": "interrupted", "cure": cure}
+        return _fail(f"interrupted; {cure}", what, as_json, EXIT_INTERRUPTED)
+    return int(code or EXIT_OK)
+
+
+def _fail(line: str, error: Mapping[str, str], as_json: bool, code: int = EXIT_USAGE) -> int:
+    print(f"broadcast-mosaic: {line}", file=sys.stderr)
+    if as_json:
+        _print_json({"exit_code": code, "error": dict(error)})
+    return code
+
+
+def _split_settings(args: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Arguments without, and with, the settings `--section.key value` or `--section.key=value`, wherever they stand."""
+    plain: list[str] = []
+    dotted: list[str] = []
+    rest = list(args)
+    while rest:
+        word = rest.pop(0)
+        if word == "--":
+            return [*plain, word, *rest], dotted
+        match = re.match(r"--[A-Za-z][\w-]*\.[\w.-]*(=)?", word)
+        if match is None:
+            plain.append(word)
+            continue
+        dotted.append(word)
+        if match[1] is None and rest and not re.match(r"-+[A-Za-z]", rest[0]):
+            dotted.append(rest.pop(0))
+    return plain, dotted
+
+
+def _settings(context: typer.Context, path: Path | None) -> Config:
+    from pipelines.config import load_config, parse_overrides
+
+    return load_config(path, parse_overrides(context.obj or []))
+
+
+def _show_settings(value: bool) -> None:
+    if value:
+        from pipelines.config import config_help
+
+        print(config_help())
+        raise typer.Exit()
+
+
+def _show_version(value: bool) -> None:
+    if value:
+        from importlib import metadata
+
+        try:
+            print(metadata.version("broadcast-mosaic"))
+        except metadata.PackageNotFoundError:
+            print("not installed: used from a checkout")
+        raise typer.Exit()
+
+
+HelpConfig = Annotated[
+    bool,
+    typer.Option(
+        "--help-config",
+        callback=_show_settings,
+        is_eager=True,
+        help="List every setting --section.key, and stop.",
+    ),
+]
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Say it, and stop.")
+    ] = False,
+) -> None: ...
+
+
+# ---- run and demo
+
+
+@app.command(epilog="Every setting is an option too: --shots.min_frames 5; run --help-config lists them.")
+def run(
+    context: typer.Context,
+    clips: Clips,
+    out: Out,
+    config: ConfigFile = None,
+    resume: Resume = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    help_config: HelpConfig = False,
+) -> int:
+    """Camera track, homographies, panorama and report of one clip, or of many (a folder each)."""
+    settings = _settings(context, config)
+    _set_up_logging(quiet, verbose)
+    if len(clips) == 1:
+        result = _run_one(clips[0], out, settings, resume, quiet)
+        results = [result]
+    else:
+        results = [
+            _run_guarded(clip, out / name, settings, resume, quiet)
+            for clip, name in zip(clips, folder_names(clips), strict=True)
+        ]
+    return _report(results, as_json, quiet)
+
+
+@app.command()
+def demo(
+    context: typer.Context,
+    out: Out,
+    resume: Resume = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> int:
+    """The sample clip through `run`, then its truth beside the estimate."""
+    settings = _settings(context, None)
+    _set_up_logging(quiet, verbose)
+    clip, truth = sample_clip()
+    result = _run_one(clip, out, settings, resume, quiet)
+    from pipelines.compare import compare_run, comparison_table
+
+    comparison = compare_run(out, truth)
+    code = _report([result], False, quiet or as_json)
+    if as_json:
+        _print_json({"exit_code": code, "clips": [_as_document(result)], "comparison": comparison})
+    elif not quiet:
+        print(f"\ntruth ({truth}) against estimate:\n{comparison_table(comparison)}")
+    return code
+
+
+def _run_one(
+    clip: Path, out: Path, config: Config, resume: bool, quiet: bool, title: str = ""
+) -> dict[str, Any]:
+    from pipelines.progress import TerminalProgress
+
+    if not clip.exists() and "%" not in clip.name:
+        # Before the seconds that the heavy imports take.
+        raise InputError(clip, "no such file", "check the path")
+    from pipelines.run import process
+
+    with TerminalProgress(title, show=not quiet) as progress:
+        record = process(clip, out, config, progress=progress, resume=resume or config.run.resume)
+    return {"clip": clip, "out": out, "record": record, "error": None}
+
+
+def _run_guarded(clip: Path, out: Path, config: Config, resume: bool, quiet: bool) -> dict[str, Any]:
+    """One clip of many: whatever happens to it is its own result, and the others go on."""
+    failed = {"clip": clip, "out": out, "record": None}
+    try:
+        return _run_one(clip, out, config, resume, quiet, f"{clip.name}: ")
+    except UserError as error:
+        print(f"broadcast-mosaic: {error}", file=sys.stderr)
+        return {**failed, "error": error.as_dict()}
+    except Exception as error:
+        log.exception("%s: a bug in broadcast-mosaic; the other clips go on", clip)
+        cause = f"{type(error).__name__}: {error}"
+        return {
+            **failed,
+            "error": {"kind": "bug", "what": str(clip), "cause": cause, "cure": "please report it"},
+        }
+
+
+def folder_names(clips: Sequence[Path]) -> list[str]:
+    """A folder name for each clip: its stem, numbered where that is taken. The same clips give the same names."""
+    names: list[str] = []
+    for clip in clips:
+        pattern = "%" in clip.name and not clip.exists()
+        stem = (clip.absolute().parent.name if pattern else clip.stem) or "clip"
+        name, number = stem, 2
+        while name in names:
+            name, number = f"{stem}-{number}", number + 1
+        names.append(name)
+    return names
+
+
+def sample_clip() -> tuple[Path, Path]:
+    """The sample clip and its truth: in assets/ of a checkout, inside the package in a wheel."""
+    package = Path(__file__).parent
+    for folder in (package / "assets", package.parent / "assets"):
+        clip, truth = folder / "sample.mp4", folder / "sample-truth.csv"
+        if clip.is_file() and truth.is_file():
+            return clip, truth
+    raise InputError("sample.mp4", "the sample clip is not installed", "install broadcast-mosaic again")
+
+
+def exit_code(results: Sequence[Mapping[str, Any]]) -> int:
+    """2 when a clip could not be used, 1 when a shot failed, none was found, or a bug struck; else 0."""
+    errors = [result["error"]["kind"] for result in results if result["error"] is not None]
+    if any(kind != "bug" for kind in errors):
+        return EXIT_USAGE
+    records = [result["record"] for result in results if result["record"] is not None]
+    failed = any(
+        not record.shots or any(shot.status == "failed" for shot in record.shots) for record in records
+    )
+    return EXIT_SHOTS_FAILED if errors or failed else EXIT_OK
+
+
+def _report(results: Sequence[Mapping[str, Any]], as_json: bool, quiet: bool) -> int:
+    code = exit_code(results)
+    if as_json:
+        _print_json({"exit_code": code, "clips": [_as_document(result) for result in results]})
+        return code
+    for result in results:
+        record = result["record"]
+        if record is None:
+            continue
+        if not quiet:
+            from pipelines.summary import print_summary
+
+            print_summary(result["out"], record)
+        for shot in record.shots:
+            if shot.status == "failed":
+                reason = shot.sentence or shot.reason
+                print(
+                    f"broadcast-mosaic: {result['clip']}: shot {shot.index} failed: {reason}", file=sys.stderr
+                )
+        if not record.shots:
+            print(f"broadcast-mosaic: {result['clip']}: no shot was found", file=sys.stderr)
+    return code
+
+
+def _as_document(result: Mapping[str, Any]) -> dict[str, Any]:
+    from pipelines.archive import run_as_dict
+
+    record = result["record"]
+    return {
+        "clip": str(result["clip"]),
+        "out": str(result["out"]),
+        "error": result["error"],
+        "run": run_as_dict(record) if record is not None else None,
+    }
+
+
+# ---- probe and compare
+
+
+@app.command("probe")
+def _probe(context: typer.Context, clip: Path, as_json: AsJson = False) -> int:
+    """What a file is: size, rate, scan, colour, time code. No processing."""
+    settings = _settings(context, None)
+    from pipelines.probe import probe, probe_text
+
+    facts = probe(clip, settings.decode)
+    if as_json:
+        _print_json({"exit_code": EXIT_OK, **facts})
+    else:
+        print(probe_text(facts))
+    return EXIT_OK
+
+
+@app.command("compare")
+def _compare(
+    context: typer.Context,
+    out: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
+    truth: Annotated[Path, typer.Argument(help="CSV of the true camera, columns as in camera.csv.")],
+    as_json: AsJson = False,
+) -> int:
+    """Errors of a run against a known camera track."""
+    if context.obj:
+        raise typer.BadParameter(f"compare has no settings, but was given {context.obj[0]}")
+    from pipelines.compare import compare_run, comparison_table
+
+    comparison = compare_run(out, truth)
+    if as_json:
+        _print_json({"exit_code": EXIT_OK, **comparison})
+    else:
+        print(comparison_table(comparison))
+    return EXIT_OK
+
+
+# ---- output
+
+
+class _CurrentStderr(logging.StreamHandler[Any]):
+    """Writes to whatever stderr is now: progress bars put themselves in its place while they show."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.setStream(sys.stderr)
+        super().emit(record)
+
+
+def _set_up_logging(quiet: bool, verbose: bool) -> None:
+    level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
+    handler = _CurrentStderr()
+    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    root = logging.getLogger()
+    for old in [h for h in root.handlers if isinstance(h, _CurrentStderr)]:
+        root.removeHandler(old)
+    root.addHandler(handler)
+    for package in ("mosaic", "calib", "pipelines"):
+        logging.getLogger(package).setLevel(level)
+
+
+def _print_json(document: Mapping[str, Any]) -> None:
+    from pipelines.archive import to_json
+
+    print(json.dumps(to_json(document), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""The table at the end of a run, for people."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pipelines.archive import read_camera_csv
+from pipelines.records import CameraTable, RunRecord
+
+WIDTH = 120  # columns where stdout is no terminal and has no width of its own
+
+
+def print_summary(out: Path, record: RunRecord) -> None:
+    """Shots with status, focal range with error, zoom and files; then the warnings, on stdout. Reads OUT/camera.csv."""
+    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else WIDTH, highlight=False)
+    camera = read_camera_csv(out / "camera.csv")
+    table = Table("shot", "pictures", "status", "focal length px", "zoom", "files", title=escape(str(out)))
+    for shot in record.shots:
+        counts = ", ".join(f"{n} {status}" for status, n in shot.status_counts.items() if n)
+        status = shot.status if shot.status == "ok" else f"{shot.status}: {shot.reason}"
+        files = ", ".join(Path(name).name for name in shot.files)
+        rows = camera.shot == shot.index
+        cells = (
+            str(shot.index),
+            f"{shot.first_frame}-{shot.last_frame} ({counts})",
+            status,
+            focal_range(camera, rows),
+            zoom_range(camera, rows),
+            files,
+        )
+        table.add_row(*(escape(cell) for cell in cells))
+    console.print(table)
+    for shot in record.shots:
+        if shot.sentence:
+            console.print(escape(f"shot {shot.index}: {shot.sentence}"))
+    for warning in record.warnings:
+        console.print(escape(f"note: {warning}"))
+    console.print(escape(f"results: {out / 'report.html'}, {out / 'camera.csv'}, {out / 'run.json'}"))
+
+
+def focal_range(camera: CameraTable, rows: np.ndarray) -> str:
+    """'2000 ± 20 to 3000 ± 31', of the shortest and the longest; 'not known' where none is claimed."""
+    known = np.flatnonzero(rows & np.isfinite(camera.f_px))
+    if not len(known):
+        return "not known"
+    ends = [known[np.argmin(camera.f_px[known])], known[np.argmax(camera.f_px[known])]]
+    shown = [f"{camera.f_px[i]:.0f} ± {camera.f_std_px[i]:.0f}" for i in ends]
+    return shown[0] if camera.f_px[ends[1]] < 1.002 * camera.f_px[ends[0]] else f"{shown[0]} to {shown[1]}"
+
+
+def zoom_range(camera: CameraTable, rows: np.ndarray) -> str:
+    """Longest over shortest focal of the shot: known even where the focal is not."""
+    zoom = camera.zoom_ratio[rows & np.isfinite(camera.zoom_ratio)]
+    return f"x{zoom.max() / zoom.min():.3f}" if len(zoom) else "not known"

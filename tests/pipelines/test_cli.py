@@ -1,0 +1,303 @@
+"""The command line with a stand-in for the pipeline: exit codes, one-line errors, JSON, settings, many clips."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines import cli
+from pipelines.archive import write_camera_csv
+from pipelines.config import Config
+from pipelines.errors import InputError, UserError
+from pipelines.output_folder import OutputFolder
+from pipelines.progress import TerminalProgress, silent
+from pipelines.records import RunRecord
+from tests.pipelines.clips import write_clip
+from tests.pipelines.tables import camera_table, run_record, shot_record
+
+HEAVY = ("torch", "cv2", "kornia", "scipy", "numba", "av", "numpy")  # pydantic is typer's own need
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Puts a quick pipelines.run in place. A clip named bad* is unusable, weak* has a failed shot, bug* trips."""
+    seen: list[dict[str, Any]] = []
+
+    def process(
+        clip: Path, out: Path, config: Config, progress: Callable[..., None], resume: bool
+    ) -> RunRecord:
+        seen.append({"clip": clip, "out": out, "config": config, "resume": resume})
+        progress("register", 1, None)
+        if clip.stem.startswith("bad"):
+            raise InputError(clip, "is not a video but text", "give the video file itself")
+        if clip.stem.startswith("bug"):
+            raise RuntimeError("index out of range")
+        if clip.stem.startswith("stop"):
+            raise KeyboardInterrupt
+        failed = clip.stem.startswith("weak")
+        shot = (
+            shot_record(status="failed", sentence="nothing could be registered") if failed else shot_record()
+        )
+        record = run_record((shot,))
+        with OutputFolder(out, "digest") as folder:
+            table = camera_table(10, f_px=np.linspace(2000, 2500, 10), f_std_px=np.full(10, 31.0))
+            write_camera_csv(folder.stage("camera.csv"), table)
+            folder.publish(record)
+        return record
+
+    module = types.ModuleType("pipelines.run")
+    module.process = process  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "pipelines.run", module)
+    return seen
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Callable[[str], str]:
+    def make(name: str) -> str:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+        return str(tmp_path / name)
+
+    return make
+
+
+def one_line(text: str) -> str:
+    [line] = text.splitlines()
+    assert "Traceback" not in line
+    return line
+
+
+@pytest.mark.parametrize("args", [["--help"], ["run", "--help"], ["--version"]])
+def test_help_loads_nothing_heavy(args: list[str]) -> None:
+    code = (
+        f"import sys; sys.argv = ['x', *{args!r}]; from pipelines.cli import main; code = main();"
+        f"print([m for m in {HEAVY!r} if m in sys.modules], code, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "[] 0\n" and done.stdout.strip()
+
+
+def test_run_passes_settings_on_and_shows_the_shots(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    toml = tmp_path / "a.toml"
+    toml.write_text("[shots]\nmin_frames = 7\nbridge_frames = 3\n")
+    args = [
+        "run",
+        "--shots.min_frames",
+        "8",
+        clip("a.mp4"),
+        "-o",
+        str(tmp_path / "out"),
+        "--config",
+        str(toml),
+    ]
+    assert cli.main([*args, "--panorama.enabled=off", "--resume"]) == 0
+    [call] = calls
+    assert call["clip"].name == "a.mp4" and call["out"] == tmp_path / "out" and call["resume"] is True
+    assert call["config"].shots.min_frames == 8 and call["config"].shots.bridge_frames == 3
+    assert call["config"].panorama.enabled is False
+    shown = capsys.readouterr()
+    assert "2000 ± 31 to 2500 ± 31" in shown.out and "report.html" in shown.out
+    assert shown.err == ""
+
+
+def test_run_json_is_one_document_on_stdout(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["run", clip("a.mp4"), "-o", str(tmp_path / "out"), "--json"]) == 0
+    shown = capsys.readouterr()
+    document = json.loads(shown.out)
+    assert document["exit_code"] == 0 and shown.err == ""
+    assert document["clips"][0]["run"]["shots"][0]["status"] == "ok"
+
+
+def test_quiet_says_nothing(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["run", clip("a.mp4"), "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_failed_shot_is_named_and_exits_1(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["run", clip("weak.mp4"), "-o", str(tmp_path / "out"), "-q"]) == 1
+    line = one_line(capsys.readouterr().err)
+    assert "weak.mp4" in line and "shot 0" in line and "nothing could be registered" in line
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_users_mistake_is_one_line_and_exit_2(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+    as_json: bool,
+) -> None:
+    good, out = clip("a.mp4"), ["-o", str(tmp_path / "out")]
+    mistakes = {
+        "no such file": ["run", str(tmp_path / "none.mp4"), *out],
+        "not a video": ["run", clip("bad.mp4"), *out],
+        "did you mean --shots.min_frames": ["run", good, *out, "--shots.min_frame", "3"],
+        "has no value": ["run", good, *out, "--shots.min_frames"],
+        "Missing option": ["run", good],
+        "No such option": ["run", good, *out, "--resum"],
+        "No such command": ["rum", good],
+        "no such file; check": ["run", good, *out, "--config", str(tmp_path / "none.toml")],
+        "finished run": ["compare", str(tmp_path / "nowhere"), good],
+        "has no settings": ["compare", good, good, "--shots.min_frames", "3"],
+    }
+    for said, args in mistakes.items():
+        assert cli.main([*args, "--json"] if as_json else args) == 2, said
+        shown = capsys.readouterr()
+        assert said in one_line(shown.err)
+        if as_json:
+            document = json.loads(shown.out)
+            assert document["exit_code"] == 2 and said.split(";")[0] in " ".join(document["error"].values())
+        else:
+            assert shown.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_interrupt_exits_130(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["run", clip("stop.mp4"), "-o", str(tmp_path / "out")]) == 130
+    assert "--resume" in one_line(capsys.readouterr().err)
+
+
+def test_a_bug_keeps_its_traceback(
+    tmp_path: Path, calls: list[dict[str, Any]], clip: Callable[[str], str]
+) -> None:
+    with pytest.raises(RuntimeError, match="index out of range"):
+        cli.main(["run", clip("bug.mp4"), "-o", str(tmp_path / "out")])
+
+
+def test_one_failing_clip_never_stops_the_others(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clips = [clip(name) for name in ("bad.mp4", "a.mp4", "b/a.mov", "weak.mp4")]
+    out = tmp_path / "out"
+    assert cli.main(["run", *clips, "-o", str(out), "--json"]) == 2
+    shown = capsys.readouterr()
+    document = json.loads(shown.out)
+    assert [Path(c["out"]).name for c in document["clips"]] == ["bad", "a", "a-2", "weak"]
+    assert [c["error"] is None for c in document["clips"]] == [False, True, True, True]
+    assert (out / "a" / "run.json").is_file() and (out / "a-2" / "run.json").is_file()
+    assert "bad.mp4" in one_line(shown.err)
+    assert cli.main(["run", *clips[1:], "-o", str(out), "-q"]) == 1
+
+
+def test_a_bug_in_one_of_many_clips_is_logged_and_the_others_go_on(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    args = ["run", clip("bug.mp4"), clip("a.mp4"), "-o", str(tmp_path / "out"), "--json"]
+    assert cli.main(args) == 1
+    shown = capsys.readouterr()
+    assert "Traceback" in shown.err and "RuntimeError: index out of range" in shown.err
+    assert json.loads(shown.out)["clips"][0]["error"]["kind"] == "bug"
+
+
+def test_image_patterns_take_the_name_of_their_folder(tmp_path: Path) -> None:
+    assert cli.folder_names([tmp_path / "take1" / "%06d.png", tmp_path / "take1", Path("x.y.mp4")]) == [
+        "take1", "take1-2", "x.y"
+    ]  # fmt: skip
+
+
+def test_demo_puts_truth_beside_estimate(
+    tmp_path: Path,
+    calls: list[dict[str, Any]],
+    clip: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    header = "frame,f_px,pan_deg,tilt_deg,roll_deg,cx_px,cy_px,aspect,k1,shot"
+    truth = tmp_path / "sample-truth.csv"
+    truth.write_text("\n".join([header, *(f"{i},2000,{i},0,0,320,180,1,0,0" for i in range(10))]) + "\n")
+    monkeypatch.setattr(cli, "sample_clip", lambda: (Path(clip("sample.mp4")), truth))
+    assert cli.main(["demo", "-o", str(tmp_path / "out")]) == 0
+    assert "f med %" in capsys.readouterr().out
+    assert cli.main(["demo", "-o", str(tmp_path / "out"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["comparison"]["shots"][0]["with_focal"] == 10
+
+
+def test_help_config_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["run", "--help-config"]) == 0
+    assert "--registration.n_fine 6000" in capsys.readouterr().out
+
+
+def test_probe_states_the_facts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_clip(tmp_path / "a.mov", 12, codec="libx264", metadata={"timecode": "10:00:00:00"})
+    assert cli.main(["probe", str(path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["size_px"] == [64, 48] and facts["fps"] == 25 and facts["timecode"] == "10:00:00:00"
+    assert facts["shots"]["estimated"] is False and facts["shots"]["reason"]
+    assert cli.main(["probe", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "64x48 (4:3)" in text and "progressive" in text and "h264" in text
+
+
+def test_probe_of_unusable_files_exits_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "text.mp4").write_text("not a video\n" * 20)
+    for path, said in (
+        (tmp_path / "text.mp4", "text"),
+        (write_clip(tmp_path / "one.mkv", 1), "only one picture"),
+    ):
+        assert cli.main(["probe", str(path)]) == 2
+        assert said in one_line(capsys.readouterr().err)
+
+
+def test_progress_is_silent_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with TerminalProgress() as progress:
+        progress("register", 1, 10)
+    silent("register", 1, 10)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_progress_shows_stage_count_and_rate_on_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    with TerminalProgress("a.mp4: ") as progress:
+        progress("register", 3, 10)
+        progress("register", 10, 10)
+        progress("register", 1, None)  # the next shot
+    shown = capsys.readouterr()
+    assert shown.out == "" and "a.mp4: register" in shown.err and "10/10" in shown.err
+
+
+def test_errors_stay_on_one_line_whatever_the_file_is_called() -> None:
+    error = UserError("two\nlines\x1b[31m.mp4", "no such file", "check the path")
+    assert str(error) == "two\\nlines\\x1b[31m.mp4: no such file; check the path"
