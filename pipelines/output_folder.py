@@ -128,11 +128,10 @@ class OutputFolder:
 
         run.json gets `files` (all of them) and `digest` beside the record's own values.
         """
-        files = sorted(
-            path.relative_to(self.staging).as_posix()
-            for path in self.staging.rglob("*")
-            if path.is_file() and path.name not in STATE and not path.name.startswith(".")
-        )
+        names = [path.relative_to(self.staging) for path in self.staging.rglob("*") if path.is_file()]
+        # Hidden names are scratch of the stages, whole folders of it included.
+        kept = [n for n in names if n.name not in STATE and not any(part.startswith(".") for part in n.parts)]
+        files = sorted(n.as_posix() for n in kept)
         stale = _files_of_earlier_run(self.out) - set(files) - {"run.json"}
         data = {**run_as_dict(record), "digest": self.digest, "files": sorted({*files, "run.json"})}
         write_json(self.staging / "run.json", data)

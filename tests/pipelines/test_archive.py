@@ -236,6 +236,7 @@ def test_outputs_appear_together_and_nothing_else_stays(tmp_path: Path) -> None:
     with OutputFolder(out, "d1") as folder:
         folder.write_camera(camera_table(2))
         folder.stage("shot-000/panorama.jpg").write_text("p")
+        folder.stage(".scratch-1/frame.yuv").write_text("s")
         assert not (out / "camera.csv").exists() and not (out / "shot-000").exists()
         folder.publish(run_record())
     assert sorted(tree(out)) == ["camera.csv", "camera.jsonl", "run.json", "shot-000/panorama.jpg"]
