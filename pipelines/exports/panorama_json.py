@@ -1,0 +1,66 @@
+"""panorama.json: where every pixel of the panorama looks, so that anybody can go from pixel to ray and back."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mosaic.composite import Panorama
+from mosaic.surface import Surface
+from pipelines.exports.whole_file import whole_file
+
+FORMULAS = {
+    "equirectangular": "x = cx + s lon, y = cy - s lat",
+    "cylindrical": "x = cx + s lon, y = cy - s tan(lat)",
+    "planar": "x = cx + s X / Z, y = cy + s Y / Z",
+}
+RAY = "(X, Y, Z) = (cos lat sin lon, -sin lat, cos lat cos lon); x right, y down, z forward"
+
+
+def panorama_facts(panorama: Panorama, *, world: str) -> dict[str, Any]:
+    """JSON-ready: projection, size_px, scale_px_per_rad, centre_px, formula, world, frames, cover.
+
+    world: what the axes are ('reference camera' or 'levelled: y along the pan axis').
+    """
+    surface, seen = panorama.surface, panorama.alpha > 0
+    counts = panorama.n_seen[seen]
+    return {
+        "format": "broadcast-mosaic panorama 1",
+        "projection": surface.kind,
+        "size_px": [surface.width, surface.height],
+        "scale_px_per_rad": surface.scale_px,
+        "centre_px": [surface.cx, surface.cy],
+        "pixel_origin": "centre of the top-left pixel is (0, 0)",
+        "formula": FORMULAS[surface.kind],
+        "ray": RAY,
+        "world": world,
+        "frames": [int(k) for k in panorama.frames],
+        "gains_rgb": [[round(float(g), 6) for g in row] for row in panorama.gains],
+        "cover": float(seen.mean()),
+        "views_median": float(np.median(counts)) if counts.size else 0.0,
+        "spread_grey_median": float(np.median(panorama.spread[seen])) if counts.size else 0.0,
+    }
+
+
+def write_panorama_json(
+    panorama: Panorama, path: str | os.PathLike[str], *, world: str = "reference camera"
+) -> None:
+    """Write panorama.json whole or not at all. Raises OSError when the folder cannot be written."""
+    with whole_file(path) as temporary:
+        text = json.dumps(panorama_facts(panorama, world=world), indent=1, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_surface(path: str | os.PathLike[str]) -> Surface:
+    """The Surface that a panorama.json states. Raises ValueError when it is not one of ours."""
+    facts = json.loads(Path(path).read_text(encoding="utf-8"))
+    if not str(facts.get("format", "")).startswith("broadcast-mosaic panorama"):
+        raise ValueError(f"{path} is not a panorama.json of broadcast-mosaic")
+    (cx, cy), (width, height) = facts["centre_px"], facts["size_px"]
+    return Surface(
+        kind=facts["projection"], scale_px=facts["scale_px_per_rad"], cx=cx, cy=cy, width=width, height=height
+    )

@@ -1,0 +1,98 @@
+"""panorama.tif: full resolution, tiled, deflate, levels of half size in SubIFDs, RGBA, BigTIFF when large.
+
+tifffile takes one tile at a time; each level is the mean over 2 x 2 px of the one above, weighted by alpha, so that
+unseen black does not darken the border of what was seen.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from mosaic.composite import Canvas, Panorama
+from pipelines.exports.panorama_jpeg import gpano_xmp
+from pipelines.exports.whole_file import whole_file
+
+TILE_PX = 512
+BIG_BYTES = 2 << 30  # uncompressed; well below the 4 GiB that a classic TIFF can address
+
+
+def write_panorama_tiff(
+    panorama: Panorama,
+    path: str | os.PathLike[str],
+    *,
+    compression_level: int = 3,
+    threads: int = 2,
+    memory_bytes: int = 200_000_000,
+    scratch: str | os.PathLike[str] | None = None,
+) -> int:
+    """Write the picture with its pyramid; returns the number of levels, the full one included.
+
+    Levels are added until both sides fit one tile. Reduced levels beyond memory_bytes live in a scratch file.
+    Raises OSError when the folder cannot be written.
+    """
+    height, width = panorama.alpha.shape
+    n_levels = 1
+    while max(height, width) >> (n_levels - 1) > TILE_PX:
+        n_levels += 1
+    canvas = Canvas(scratch or tempfile.gettempdir(), memory_bytes)
+    packet = gpano_xmp(panorama.surface) if panorama.surface.kind == "equirectangular" else None
+    extra = [] if packet is None else [(700, "B", len(packet), packet, True)]
+    with (
+        whole_file(path) as temporary,
+        tifffile.TiffWriter(temporary, bigtiff=width * height * 16 // 3 > BIG_BYTES) as writer,
+    ):
+        image, alpha = panorama.image, panorama.alpha
+        for level in range(n_levels):
+            if level:
+                image, alpha = halve(image, alpha, canvas)
+            writer.write(
+                _tiles(image, alpha),
+                shape=(*alpha.shape, 4), dtype=np.uint8, photometric="rgb", extrasamples=["unassalpha"],
+                tile=(TILE_PX, TILE_PX), compression="zlib", compressionargs={"level": compression_level},
+                maxworkers=threads, subifds=n_levels - 1 if level == 0 else None, subfiletype=1 if level else 0,
+                extratags=extra if level == 0 else [], software="broadcast-mosaic", metadata=None,
+            )  # fmt: skip
+            panorama.release()
+            canvas.release()
+    return n_levels
+
+
+def _tiles(image: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
+    """RGBA tiles row by row, those at the border padded with transparent black."""
+    height, width = alpha.shape
+    for y in range(0, height, TILE_PX):
+        for x in range(0, width, TILE_PX):
+            tile = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
+            part = alpha[y : y + TILE_PX, x : x + TILE_PX]
+            tile[: part.shape[0], : part.shape[1], :3] = image[y : y + TILE_PX, x : x + TILE_PX]
+            tile[: part.shape[0], : part.shape[1], 3] = part
+            yield tile
+
+
+def halve(
+    image: NDArray[np.uint8], alpha: NDArray[np.uint8], canvas: Canvas
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Means over 2 x 2 px, colours weighted by alpha; an odd last row or column stands for two."""
+    height, width = alpha.shape
+    small = ((height + 1) // 2, (width + 1) // 2)
+    half_image, half_alpha = canvas.zeros((*small, 3)), canvas.zeros(small)
+    step = 256
+    for row in range(0, small[0], step):
+        source = np.s_[2 * row : 2 * (row + step)]
+        part, share = image[source], alpha[source]
+        pad = ((0, part.shape[0] % 2), (0, width % 2))
+        part = np.pad(part, (*pad, (0, 0)), mode="edge")
+        share = np.pad(share, pad, mode="edge").astype(np.uint32)
+        colour = sum(part[i::2, j::2] * share[i::2, j::2, None] for i in (0, 1) for j in (0, 1))
+        total = sum(share[i::2, j::2] for i in (0, 1) for j in (0, 1))
+        target = np.s_[row : row + step]
+        divisor = np.maximum(total, 1)[..., None]
+        half_image[target] = (colour + divisor // 2) // divisor
+        half_alpha[target] = (total + 2) // 4
+    return half_image, half_alpha
