@@ -37,9 +37,10 @@ class ClipSpec:
     """One shot. Everything random comes from `seed`; world_seed, when given, keeps the venue while the rest changes.
 
     player_share: wanted mean share of the picture's pixels (None: players of 1.8 m). led_scroll_m_s: speed of the
-    hoardings' content; led_flip_s: seconds between switches (0: never). exposure_drift: relative amplitude of a slow
-    sine; exposure_ramp_stops: change over the shot. flicker: relative amplitude from frame to frame. shutter: exposure
-    over frame time (0: no motion blur). duplicate_every: every n-th frame repeats the one before (0: none).
+    hoardings' content; led_flip_s: seconds between switches (0: never). crowd_sway_m: how far people in the stands
+    lean. exposure_drift: relative amplitude of a slow sine; exposure_ramp_stops: change over the shot. flicker:
+    relative amplitude from frame to frame. shutter: exposure over frame time (0: no motion blur). duplicate_every:
+    every n-th frame repeats the one before (0: none).
     crf replaces bitrate_bit_s (None: 8 Mbit/s at 1080p25, in proportion).
     """
 
@@ -59,6 +60,7 @@ class ClipSpec:
     standing_players: int = 0
     led_scroll_m_s: float = 0.0
     led_flip_s: float = 0.0
+    crowd_sway_m: float = 0.0
     scoreboard: bool = True
     logo: bool = True
     noise_grey: float = 2.0
@@ -202,7 +204,13 @@ class SynthClip:
     def _scene(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         camera = self.path.camera(t)
         seconds = t / float(self.spec.fps)
-        return self.renderer.render(camera, squad=self.squad, time_s=seconds, led_shift_m=self._led_shift(t))
+        return self.renderer.render(
+            camera,
+            squad=self.squad,
+            time_s=seconds,
+            led_shift_m=self._led_shift(t),
+            sway_m=self.spec.crowd_sway_m,
+        )
 
     def _expose_scene(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """The scene, averaged over the time that the shutter is open."""
@@ -215,11 +223,12 @@ class SynthClip:
         a, b = self.path.camera(index - half), self.path.camera(index + half)
         smear = float(np.nanmax(np.linalg.norm(b.ray_to_pixel(a.pixel_to_ray(corners)) - corners, axis=-1)))
         n = int(np.clip(np.ceil(smear / _BLUR_STEP_PX), 2, 24))
-        total, covered = np.zeros((self.spec.height, self.spec.width, 3), np.float32), None
+        total = np.zeros((self.spec.height, self.spec.width, 3), np.float32)
+        covered = np.zeros((self.spec.height, self.spec.width), np.uint8)
         for t in index + self.spec.shutter * ((np.arange(n) + 0.5) / n - 0.5):
             image, cover = self._scene(float(t))
             total += image
-            covered = cover if covered is None else np.maximum(covered, cover)
+            covered = np.maximum(covered, cover)
         return (total / n + 0.5).astype(np.uint8), covered
 
 
@@ -228,7 +237,7 @@ def _quarter(camera: SynthCamera) -> SynthCamera:
     return SynthCamera(
         width=camera.width // 4, height=camera.height // 4, f_px=camera.f_px / 4, pan_rad=camera.pan_rad,
         tilt_rad=camera.tilt_rad, roll_rad=camera.roll_rad, cx_px=(camera.cx_px + 0.5) / 4 - 0.5,
-        cy_px=(camera.cy_px + 0.5) / 4 - 0.5, k1_half=camera.k1_half, pupil_m=camera.pupil_m,
+        cy_px=(camera.cy_px + 0.5) / 4 - 0.5, k1_half=camera.k1_half, aspect=camera.aspect, pupil_m=camera.pupil_m,
     )  # fmt: skip
 
 
@@ -341,6 +350,8 @@ def _open_stream(container: av.container.OutputContainer, spec: ClipSpec) -> av.
     if spec.crf is not None:
         options["crf"] = str(spec.crf)
     stream = container.add_stream(spec.codec, rate=spec.fps, options=options)
+    if not isinstance(stream, av.VideoStream):
+        raise ValueError(f"codec {spec.codec!r} is not a video codec")
     stream.width, stream.height, stream.pix_fmt = spec.width, spec.height, spec.pix_fmt
     stream.time_base = 1 / spec.fps
     if spec.crf is None:
@@ -348,6 +359,8 @@ def _open_stream(container: av.container.OutputContainer, spec: ClipSpec) -> av.
         stream.bit_rate = int(spec.bitrate_bit_s or _BITRATE_1080P25 * size)
     context = stream.codec_context
     context.color_range, context.colorspace, context.color_primaries, context.color_trc = 1, 1, 1, 1
+    # an anamorphic file: fx / fy = height / width of a pixel
+    context.sample_aspect_ratio = 1 / Fraction(spec.lens.aspect).limit_denominator(1000)
     context.thread_count = 2
     return stream
 

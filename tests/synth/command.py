@@ -39,6 +39,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--players", type=float, dest="player_share", help="share of the picture, 0 .. .4")
     p.add_argument("--standing", type=int, dest="standing_players")
     p.add_argument("--led", type=float, dest="led_scroll_m_s")
+    p.add_argument("--sway", type=float, dest="crowd_sway_m", help="people in the stands lean by so many m")
     p.add_argument("--noise", type=float, dest="noise_grey")
     p.add_argument("--drift", type=float, dest="exposure_drift")
     p.add_argument("--ramp", type=float, dest="exposure_ramp_stops")

@@ -262,7 +262,7 @@ def _from_strip(strip, s, height_share, out):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _structure(stadium, segment, s, z, q, salt, plain, board, ribbon, colours, out):
-    """Everything above the pitch. plain: 1 lowers the contrast of all above the lower tier (texture in a band)."""
+    """Everything above the pitch. plain: 1 covers all above the middle of the lower tier (texture in a band)."""
     z0, z1 = stadium.profile[segment - 1, 1], stadium.profile[segment - 1, 3]
     share = (z - z0) / (z1 - z0)
     grain = _hash(int(np.floor(s * 12)), int(np.floor(z * 12)), salt + 20)
@@ -280,7 +280,9 @@ def _structure(stadium, segment, s, z, q, salt, plain, board, ribbon, colours, o
     elif segment in (LOWER_TIER, UPPER_TIER):
         q0, q1 = stadium.profile[segment - 1, 0], stadium.profile[segment - 1, 2]
         slope = np.sqrt((q1 - q0) ** 2 + (z1 - z0) ** 2) / abs(q1 - q0)
-        full = 1.0 - 0.94 * plain if segment == UPPER_TIER else 1.0
+        full = 1.0
+        if segment == UPPER_TIER or share > 0.5:
+            full -= 0.94 * plain
         _crowd(s, (q - q0) * slope, salt + 40 * segment, colours, full, out)
         shade = 1.0 if segment == LOWER_TIER else 0.86
         for k in range(3):

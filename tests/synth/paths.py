@@ -11,18 +11,19 @@ import numpy as np
 
 from tests.synth.camera import SynthCamera
 
-PATH_KINDS = ("pan_zoom", "pan_only", "pure_zoom", "locked_off", "whip")
+PATH_KINDS = ("pan_zoom", "pan_only", "pure_zoom", "locked_off", "whip", "track")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensSpec:
     """Radial distortion k1_half(f) = c0 + c1 log(f / W); principal-point offset from the picture's centre in px at
-    W = 1280 (scaled with W); pupil_m: entrance pupil in front of the pan axis."""
+    W = 1280 (scaled with W); pupil_m: entrance pupil in front of the pan axis; aspect: fx / fy (anamorphic files)."""
 
     c0: float = 0.0
     c1: float = 0.0
     pp_offset_px_1280: tuple[float, float] = (0.0, 0.0)
     pupil_m: float = 0.0
+    aspect: float = 1.0
 
     def k1_half(self, f_px: float, width: int) -> float:
         return self.c0 + self.c1 * float(np.log(f_px / width))
@@ -38,6 +39,8 @@ class PathSpec:
 
     pan_deg: full range, from -pan/2 to +pan/2 about pan0_deg. zoom: ratio of longest to widest focal length.
     f0_per_width: widest focal length over W. jitter_px: rms of the operator's tremor, px at the widest focal, W = 1280.
+    track, for kind "track": a row a frame of (f / W, pan, tilt, roll in degrees), a real operator's path; nothing is
+    added to it.
     """
 
     kind: str = "pan_zoom"
@@ -52,12 +55,17 @@ class PathSpec:
     there_and_back: bool = False
     jitter_px: float = 0.25
     whip_frames: int = 14
+    track: tuple[tuple[float, float, float, float], ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in PATH_KINDS:
             raise ValueError(f"path kind {self.kind!r} is none of {PATH_KINDS}")
         if self.zoom_style not in ("in_out", "in"):
             raise ValueError(f"zoom_style {self.zoom_style!r} is none of ('in_out', 'in')")
+        if (self.kind == "track") != bool(self.track):
+            raise ValueError(
+                f"kind {self.kind!r} with {len(self.track)} rows of track: the one needs the other"
+            )
         if self.zoom < 1:
             raise ValueError(f"zoom {self.zoom} < 1: give the ratio of longest to widest")
 
@@ -92,6 +100,31 @@ class CameraPath:
 
     def camera(self, t: float) -> SynthCamera:
         """Camera at frame time t (frames, real)."""
+        f_px, pan, tilt, roll = self._tracked(t) if self.spec.kind == "track" else self._performed(t)
+        dx, dy = (d * self.width / 1280 for d in self.lens.pp_offset_px_1280)
+        return SynthCamera(
+            width=self.width,
+            height=self.height,
+            f_px=f_px,
+            pan_rad=pan,
+            tilt_rad=tilt,
+            roll_rad=roll,
+            cx_px=(self.width - 1) / 2 + dx,
+            cy_px=(self.height - 1) / 2 + dy,
+            k1_half=self.lens.k1_half(f_px, self.width),
+            aspect=self.lens.aspect,
+            pupil_m=self.lens.pupil_m,
+        )
+
+    def _tracked(self, t: float) -> tuple[float, float, float, float]:
+        """f px, pan, tilt, roll rad of the given track, linear between its rows."""
+        track = np.asarray(self.spec.track)
+        row = [float(np.interp(t, np.arange(len(track)), track[:, k])) for k in range(4)]
+        pan, tilt, roll = np.deg2rad(row[1:])
+        return row[0] * self.width, float(pan), float(tilt), float(roll)
+
+    def _performed(self, t: float) -> tuple[float, float, float, float]:
+        """f px, pan, tilt, roll rad of the move that the spec describes."""
         s = self.spec
         u = t / max(self.n_frames - 1, 1)
         there = float(ease(u) if not s.there_and_back else ease(2 * u) - ease(2 * u - 1))
@@ -111,19 +144,8 @@ class CameraPath:
             amplitude, omega, phase = self._tremor
             tremor = (amplitude * np.sin(omega * t + phase)).sum(axis=1)
             tremor *= s.jitter_px / 1280 / s.f0_per_width * np.array([1.0, 1.0, 0.3])
-        dx, dy = (d * self.width / 1280 for d in self.lens.pp_offset_px_1280)
-        return SynthCamera(
-            width=self.width,
-            height=self.height,
-            f_px=f_px,
-            pan_rad=float(np.deg2rad(s.pan0_deg) + pan + tremor[0]),
-            tilt_rad=float(np.deg2rad(s.tilt0_deg) + tilt + tremor[1]),
-            roll_rad=float(np.deg2rad(s.roll_deg) + tremor[2]),
-            cx_px=(self.width - 1) / 2 + dx,
-            cy_px=(self.height - 1) / 2 + dy,
-            k1_half=self.lens.k1_half(f_px, self.width),
-            pupil_m=self.lens.pupil_m,
-        )
+        angles = np.deg2rad([s.pan0_deg, s.tilt0_deg, s.roll_deg]) + np.array([pan, tilt, 0.0]) + tremor
+        return f_px, float(angles[0]), float(angles[1]), float(angles[2])
 
     def cameras(self) -> list[SynthCamera]:
         """One camera a frame."""

@@ -60,13 +60,16 @@ def make_squad(
     heading = rng.uniform(0, 2 * np.pi, n)
     velocity = np.stack([speed * np.cos(heading), 0.5 * speed * np.sin(heading)], -1)
     velocity[:standing] = 0
+    # stratified in time and across the picture, or large figures would stand in a heap
+    when, where = (
+        (rng.permutation(n) + rng.uniform(size=n)) / n,
+        (rng.permutation(n) + rng.uniform(size=n)) / n,
+    )
     for i in range(n):
-        share = 0.5 if i < standing else rng.uniform()
+        share = 0.5 if i < standing else when[i]
         camera = cameras[min(int(share * len(cameras)), len(cameras) - 1)]
         # feet below the hoardings: the lower three quarters of the picture, more at the far side, as on a pitch
-        pixel = np.array(
-            [rng.uniform(0.05, 0.95) * camera.width, (0.30 + 0.68 * rng.uniform() ** 1.3) * camera.height]
-        )
+        pixel = np.array([where[i] * camera.width, (0.30 + 0.68 * rng.uniform() ** 1.3) * camera.height])
         ray = camera.pixel_to_ray(pixel)
         ground = ray * (stadium.camera_height / max(ray[1], 0.03))
         at = np.clip(np.array([ground[0], ground[2] - stadium.camera_back]), -limit, limit)
@@ -163,7 +166,7 @@ def draw_capsules(image, mask, ends, radii, colours, stripe):
                 for k in range(3):
                     value = min(colours[m, k] * shade, 255.0)
                     image[y, x, k] = np.uint8(image[y, x, k] * (1 - cover) + value * cover + 0.5)
-                mask[y, x] = max(mask[y, x], np.uint8(255 * cover))
+                mask[y, x] = max(mask[y, x], np.uint8(min(255 * cover + 1, 255.0)))
 
 
 def draw_players(

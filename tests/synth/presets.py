@@ -74,6 +74,7 @@ def _hard(seed: int) -> ClipSpec:
         player_share=0.40,
         board_height_m=5.0,
         led_scroll_m_s=2.5,
+        crowd_sway_m=0.12,
         flash_frame=90,
         duplicate_every=5,
         exposure_drift=0.05,

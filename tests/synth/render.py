@@ -13,8 +13,15 @@ import numpy as np
 
 from tests.synth.camera import Array, SynthCamera
 from tests.synth.players import Squad, draw_players
-from tests.synth.sampling import NODE_MARGIN, expose, sample_frame, sample_points
-from tests.synth.stadium import BOARD, depth_along, perimeter_coordinate
+from tests.synth.sampling import NODE_MARGIN, Alive, expose, sample_frame, sample_points
+from tests.synth.stadium import (
+    BOARD,
+    LOWER_TIER,
+    UPPER_TIER,
+    depths_along,
+    perimeter_coordinate,
+    profile_edges,
+)
 from tests.synth.world import PSF_PX, World
 
 _NODE_STEP_PUPIL = 8  # px; parallax has kinks at the hoardings
@@ -42,7 +49,7 @@ def texel_map(world: World, camera: SynthCamera, pixels: Array) -> Array:
     flat = rays.reshape(-1, 3)
     seen = flat.copy()
     for _ in range(_PUPIL_STEPS):
-        depth = np.array([depth_along(world.stadium, d[0], d[1], d[2]) for d in seen])
+        depth = depths_along(world.stadium, seen)
         # t with |pupil + t ray| = depth
         along = flat @ pupil
         t = -along + np.sqrt(along**2 + depth**2 - pupil @ pupil)
@@ -77,13 +84,18 @@ def _level_for(world: World, px_per_rad: float) -> tuple[int, float]:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Renderer:
-    """Renders one world. Holds the hoardings' tables and the last blurred level, nothing of the frames."""
+    """Renders one world. Holds the tables of what moves in it, nothing of the frames."""
 
     world: World
-    _led: tuple[np.ndarray, np.ndarray, float, float] | None = None
+    _tables: Alive | None = None
 
-    def render_clean(self, camera: SynthCamera, *, led_shift_m: float = 0.0) -> np.ndarray:
-        """The environment alone (h, w, 3) uint8 RGB: no players, no noise, no graphics."""
+    def render_clean(
+        self, camera: SynthCamera, *, led_shift_m: float = 0.0, sway_m: float = 0.0, time_s: float = 0.0
+    ) -> np.ndarray:
+        """The environment alone (h, w, 3) uint8 RGB: no players, no noise, no graphics.
+
+        led_shift_m: how far the hoardings' content has run; sway_m: how far people in the stands lean, at time_s.
+        """
         step = node_step(camera)
         nodes = node_map(self.world, camera, step)
         level, blur = _level_for(self.world, camera.f_px)
@@ -93,14 +105,9 @@ class Renderer:
         lo, hi = nodes.reshape(-1, 2).min(axis=0), nodes.reshape(-1, 2).max(axis=0)
         x0, y0 = (int(max(np.floor(v) - margin, 0)) for v in lo)
         x1, y1 = (int(min(np.ceil(v) + margin, n)) for v, n in zip(hi, image.shape[1::-1], strict=True))
-        source = image[y0:y1, x0:x1]
-        if blur > 0.05:
-            source = cv2.GaussianBlur(source, (0, 0), blur, borderType=cv2.BORDER_REFLECT_101)
-        led, x_of_s, s_first, s_step = self._led_tables() if led_shift_m else _NO_LED
+        alive = self._alive(level, blur, led_shift_m, sway_m, time_s)
         out = np.empty((camera.height, camera.width, 3), np.uint8)
-        sample_frame(
-            source, x0, y0, nodes, step, led, x_of_s, s_first, s_step, float(led_shift_m), 2.0**level, out
-        )
+        sample_frame(_blurred(image[y0:y1, x0:x1], blur), x0, y0, nodes, step, 2.0**level, alive, out)
         return out
 
     def sample_environment(self, rays: np.ndarray, px_per_rad: float) -> np.ndarray:
@@ -109,9 +116,7 @@ class Renderer:
         (..., 3) float32 RGB 0..255; NaN where nothing was painted.
         """
         level, blur = _level_for(self.world, px_per_rad)
-        source = self.world.levels[level]
-        if blur > 0.05:
-            source = cv2.GaussianBlur(source, (0, 0), blur, borderType=cv2.BORDER_REFLECT_101)
+        source = _blurred(self.world.levels[level], blur)
         texel = self.world.rays_to_texel(np.asarray(rays, dtype=np.float64)).reshape(-1, 2) / 2**level
         out = np.empty((len(texel), 3), np.float32)
         sample_points(source, texel[:, 0].copy(), texel[:, 1].copy(), out)
@@ -124,36 +129,77 @@ class Renderer:
         squad: Squad | None = None,
         time_s: float = 0.0,
         led_shift_m: float = 0.0,
+        sway_m: float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Scene with players -> (picture (h, w, 3) uint8, cover (h, w) uint8: 255 = player)."""
-        image = self.render_clean(camera, led_shift_m=led_shift_m)
+        image = self.render_clean(camera, led_shift_m=led_shift_m, sway_m=sway_m, time_s=time_s)
         cover = np.zeros(image.shape[:2], np.uint8)
         if squad is not None:
             draw_players(image, cover, squad, camera, self.world.stadium, time_s)
         return image, cover
 
-    def _led_tables(self) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """Top and bottom row and perimeter coordinate of the hoardings per level-0 column, and the way back."""
-        if self._led is None:
-            world = self.world
-            width = world.levels[0].shape[1]
-            led = np.empty((3, width))
-            height = world.stadium.profile[BOARD - 1, 3]
-            for col in range(width):
-                lon = world.lon_left + col / world.px_per_rad
-                dx, dy = np.sin(lon), np.cos(lon)
-                face, rho = _board(world, dx, dy)
-                led[2, col] = perimeter_coordinate(world.stadium, face, rho * dx, rho * dy)
-                led[0, col] = world.px_per_rad * (
-                    world.tan_top + (world.stadium.camera_height - height) / rho
-                )
-                led[1, col] = world.px_per_rad * (world.tan_top + world.stadium.camera_height / rho)
-            s = np.linspace(led[2, 0], led[2, -1], 4 * width)
-            self._led = (led, np.interp(s, led[2], np.arange(width)), float(s[0]), float(s[1] - s[0]))
-        return self._led
+    def _alive(self, level: int, blur: float, led_shift_m: float, sway_m: float, time_s: float) -> Alive:
+        """Tables for one frame; the hoardings' rows are cut out and blurred only where their content runs."""
+        if not led_shift_m and not sway_m:
+            return _STILL
+        if self._tables is None:
+            self._tables = _make_tables(self.world)
+        still = self._tables
+        scale = self.world.px_per_rad / float(
+            self.world.stadium.faces[0, 2]
+        )  # texels a metre, opposite the camera
+        alive = still._replace(sway=float(sway_m * scale), cell=0.6 * scale, time_s=float(time_s))
+        if led_shift_m:
+            image = self.world.levels[level]
+            y0 = int(np.clip(still.led[0].min() / 2**level - 12, 0, image.shape[0] - 8))
+            y1 = int(np.clip(still.led[1].max() / 2**level + 12, y0 + 8, image.shape[0]))
+            board = np.ascontiguousarray(_blurred(image[y0:y1], blur))
+            alive = alive._replace(shift_m=float(led_shift_m), board_source=board, board_y_off=y0)
+        return alive
 
 
-_NO_LED = (np.zeros((3, 2)), np.zeros(2), 0.0, 1.0)
+def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian blur, or the contiguous picture itself where there is nothing to blur."""
+    if sigma <= 0.05:
+        return np.ascontiguousarray(image)
+    return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
+
+
+def _make_tables(world: World) -> Alive:
+    """Rows of hoardings and tiers and the hoardings' perimeter coordinate per level-0 column, nothing moving yet."""
+    width = world.levels[0].shape[1]
+    lon = world.lon_left + np.arange(width) / world.px_per_rad
+    rows = world.px_per_rad * (world.tan_top - profile_edges(world.stadium, lon))
+    led = np.empty((3, width))
+    led[0], led[1] = rows[BOARD], rows[BOARD - 1]
+    for col in range(width):
+        dx, dy = np.sin(lon[col]), np.cos(lon[col])
+        face, rho = _board(world, dx, dy)
+        led[2, col] = perimeter_coordinate(world.stadium, face, rho * dx, rho * dy)
+    s = np.linspace(led[2, 0], led[2, -1], 4 * width)
+    crowd = np.stack([rows[UPPER_TIER], rows[UPPER_TIER - 1], rows[LOWER_TIER], rows[LOWER_TIER - 1]])
+    return _STILL._replace(
+        led=led,
+        x_of_s=np.interp(s, led[2], np.arange(width)),
+        s_first=float(s[0]),
+        s_step=float(s[1] - s[0]),
+        crowd=crowd,
+    )
+
+
+_STILL = Alive(
+    led=np.zeros((3, 2)),
+    x_of_s=np.zeros(2),
+    s_first=0.0,
+    s_step=1.0,
+    shift_m=0.0,
+    board_source=np.zeros((8, 8, 3), np.uint8),
+    board_y_off=0,
+    crowd=np.zeros((4, 2)),
+    sway=0.0,
+    cell=1.0,
+    time_s=0.0,
+)
 
 
 def _board(world: World, dx: float, dy: float) -> tuple[int, float]:

@@ -5,6 +5,8 @@ cv2.remap is not used: its fixed-point weights (1/32 px) would be an error of th
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -58,16 +60,65 @@ def expand_row(nodes, step, row, xs, ys):
         ys[col] = a * ly[i - 1] + b * ly[i] + c * ly[i + 1] + d * ly[i + 2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _scroll_row(xs, ys, scale, led, x_of_s, s_first, s_step, shift_m):
-    """Move what lies on the hoardings along them by shift_m.
+class Alive(NamedTuple):
+    """What moves in the environment itself. Tables are per level-0 texel column; y and x in level-0 texels.
 
-    led (3, W): top y, bottom y, perimeter s of each texel column.
+    led (3, W): top y, bottom y of the hoardings, perimeter s (m); x_of_s (n,): the way back, from s_first in steps of
+    s_step; shift_m: how far the content has run; board_source: the hoardings' rows of the level, all columns, from row
+    board_y_off. crowd (4, W): top and bottom y of upper and lower tier; sway: amplitude, cell: a person's size, texels.
     """
+
+    led: np.ndarray
+    x_of_s: np.ndarray
+    s_first: float
+    s_step: float
+    shift_m: float
+    board_source: np.ndarray
+    board_y_off: int
+    crowd: np.ndarray
+    sway: float
+    cell: float
+    time_s: float
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sway_row(xs, ys, scale, alive):
+    """People lean and wave: a smooth displacement, zero on the border of each person's cell, own phase and pace."""
+    width = alive.crowd.shape[1]
+    for col in range(xs.shape[0]):
+        x, y = xs[col] * scale, ys[col] * scale
+        i = int(x)
+        if not (0 <= i < width):
+            continue
+        if alive.crowd[0, i] < y < alive.crowd[1, i] or alive.crowd[2, i] < y < alive.crowd[3, i]:
+            a, b = int(x / alive.cell), int(y / alive.cell)
+            u, v = x / alive.cell - a, y / alive.cell - b
+            z = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F)
+            z = (z ^ (z >> np.uint64(31))) * np.uint64(0xBF58476D1CE4E5B9)
+            z ^= z >> np.uint64(29)
+            pace = 1.0 + 6.0 * np.float64(z & np.uint64(1023)) / 1024.0
+            phase = 6.2832 * np.float64((z >> np.uint64(10)) & np.uint64(1023)) / 1024.0
+            angle = 6.2832 * np.float64((z >> np.uint64(20)) & np.uint64(1023)) / 1024.0
+            push = alive.sway / scale * 16 * u * (1 - u) * v * (1 - v) * np.sin(pace * alive.time_s + phase)
+            xs[col] += push * np.cos(angle)
+            ys[col] += push * np.sin(angle)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scroll_row(xs, ys, on_board, scale, alive):
+    """Address the hoardings' content shift_m further along; on_board marks the pixels to read from board_source."""
+    led, x_of_s, s_first, s_step, shift_m = (
+        alive.led,
+        alive.x_of_s,
+        alive.s_first,
+        alive.s_step,
+        alive.shift_m,
+    )
     width, n = led.shape[1], x_of_s.shape[0]
     period = (n - 1) * s_step
     for col in range(xs.shape[0]):
         x, y = xs[col] * scale, ys[col] * scale
+        on_board[col] = False
         if not (0 <= x < width - 1):
             continue
         i = int(x)
@@ -85,38 +136,48 @@ def _scroll_row(xs, ys, scale, led, x_of_s, s_first, s_step, shift_m):
             new_bottom = led[1, i] * (1 - u) + led[1, i + 1] * u
             ys[col] = (new_top + (y - top) / (bottom - top) * (new_bottom - new_top)) / scale
             xs[col] = x_new / scale
+            on_board[col] = True
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def sample_frame(source, x_off, y_off, nodes, step, led, x_of_s, s_first, s_step, shift_m, scale, out):
+def _read(source, x, y, out, row, col):
+    """One pixel of sample_frame; at the rim of the source its last full neighbourhood."""
+    x = min(max(x, 1.0), source.shape[1] - 3.0)
+    y = min(max(y, 1.0), source.shape[0] - 3.0)
+    i, j = int(x), int(y)
+    wa, wb, wc, wd = _catmull_rom(np.float32(x - i))
+    va, vb, vc, vd = _catmull_rom(np.float32(y - j))
+    for k in range(3):
+        acc = np.float32(0.5)
+        for m, v in ((j - 1, va), (j, vb), (j + 1, vc), (j + 2, vd)):
+            acc += v * (
+                wa * np.float32(source[m, i - 1, k])
+                + wb * np.float32(source[m, i, k])
+                + wc * np.float32(source[m, i + 1, k])
+                + wd * np.float32(source[m, i + 2, k])
+            )
+        out[row, col, k] = np.uint8(min(max(acc, np.float32(0.0)), np.float32(255.0)))
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def sample_frame(source, x_off, y_off, nodes, step, scale, alive, out):
     """Bicubic picture out (h, w, 3) uint8 of source (H, W, 3) uint8, texel (0, 0) at (x_off, y_off) of its level.
 
-    nodes: texel coordinates on the level; scale: level-0 texels per level texel; led tables at level 0 (shift_m 0:
-    still).
+    nodes: texel coordinates on the level; scale: level-0 texels per level texel; alive: what moves (0: still).
     """
     h, w = out.shape[0], out.shape[1]
-    hs, ws = source.shape[0], source.shape[1]
-    xs, ys = np.empty(w), np.empty(w)
+    xs, ys, on_board = np.empty(w), np.empty(w), np.zeros(w, np.bool_)
     for row in range(h):
         expand_row(nodes, step, row, xs, ys)
-        if shift_m != 0.0:
-            _scroll_row(xs, ys, scale, led, x_of_s, s_first, s_step, shift_m)
+        if alive.sway != 0.0:
+            _sway_row(xs, ys, scale, alive)
+        if alive.shift_m != 0.0:
+            _scroll_row(xs, ys, on_board, scale, alive)
         for col in range(w):
-            x = min(max(xs[col] - x_off, 1.0), ws - 3.0)
-            y = min(max(ys[col] - y_off, 1.0), hs - 3.0)
-            i, j = int(x), int(y)
-            wa, wb, wc, wd = _catmull_rom(np.float32(x - i))
-            va, vb, vc, vd = _catmull_rom(np.float32(y - j))
-            for k in range(3):
-                acc = np.float32(0.5)
-                for m, v in ((j - 1, va), (j, vb), (j + 1, vc), (j + 2, vd)):
-                    acc += v * (
-                        wa * np.float32(source[m, i - 1, k])
-                        + wb * np.float32(source[m, i, k])
-                        + wc * np.float32(source[m, i + 1, k])
-                        + wd * np.float32(source[m, i + 2, k])
-                    )
-                out[row, col, k] = np.uint8(min(max(acc, np.float32(0.0)), np.float32(255.0)))
+            if on_board[col]:
+                _read(alive.board_source, xs[col], ys[col] - alive.board_y_off, out, row, col)
+            else:
+                _read(source, xs[col] - x_off, ys[col] - y_off, out, row, col)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

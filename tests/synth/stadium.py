@@ -131,3 +131,24 @@ def depth_along(stadium, x, y, z):
     if rho > 2000.0:
         rho = 2000.0  # the sky: far enough that a pupil of a metre does not matter
     return rho * np.sqrt(1 + tan_up * tan_up)
+
+
+@njit(cache=True, nogil=True)
+def depths_along(stadium, rays):
+    """depth_along for directions (n, 3) -> (n,) m."""
+    out = np.empty(rays.shape[0])
+    for i in range(rays.shape[0]):
+        out[i] = depth_along(stadium, rays[i, 0], rays[i, 1], rays[i, 2])
+    return out
+
+
+def profile_edges(stadium: Stadium, lon_rad: np.ndarray) -> np.ndarray:
+    """Where the profile's corners are seen: (8, n) tan of elevation of the foot of BOARD and the top of each segment.
+
+    A corner is a line at offset q and height z along the polygon; lon_rad (n,) are directions from the pan axis.
+    """
+    corners = np.vstack([stadium.profile[:1, :2], stadium.profile[:, 2:]])
+    along = stadium.faces[:, :2] @ np.stack([np.sin(lon_rad), np.cos(lon_rad)])
+    along = np.where(along > 1e-9, along, np.nan)
+    rho = np.nanmin((stadium.faces[:, 2, None] + corners[:, 0, None, None]) / along, axis=1)
+    return (corners[:, 1, None] - stadium.camera_height) / rho

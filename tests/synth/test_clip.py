@@ -175,6 +175,40 @@ def test_paths_do_only_what_they_say(kind: str) -> None:
     assert (np.ptp(angles, axis=0).max() > 0) == (kind == "pan_only")
 
 
+def test_track_is_followed() -> None:
+    rows = tuple((1.4 + 0.02 * k, 3.0 - k, -10.0 + 0.1 * k, 0.2) for k in range(5))
+    cameras = SynthClip(
+        dataclasses.replace(SMALL, n_frames=5, path=PathSpec(kind="track", track=rows))
+    ).cameras
+    found = [(c.f_px / 320, *np.rad2deg((c.pan_rad, c.tilt_rad, c.roll_rad))) for c in cameras]
+    assert np.allclose(found, rows, atol=1e-12)
+
+
+def test_anamorphic_file_says_so(tmp_path: Path) -> None:
+    spec = dataclasses.replace(SMALL, lens=LensSpec(aspect=0.75), n_frames=2)
+    truth = read_truth(write_clip(tmp_path / "a.mp4", spec))
+    assert truth["aspect"].tolist() == [0.75, 0.75]
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].sample_aspect_ratio == Fraction(4, 3)
+
+
+def test_crowd_sways_about_its_place() -> None:
+    """Only the stands change, and over time the mean shift of their texture is nil."""
+    clip = SynthClip(SMALL)
+    camera = clip.camera(0)
+    still = clip.renderer.render_clean(camera).astype(float)
+    moved = [clip.renderer.render_clean(camera, sway_m=0.15, time_s=t).astype(float) for t in (0.0, 1.0, 2.7)]
+    changed = np.abs(moved[1] - still).max(axis=-1) > 0
+    foot = int(
+        camera.ray_to_pixel(np.array([0.0, clip.world.stadium.camera_height, 108.0]))[1]
+    )  # of the hoardings
+    assert changed[:foot].mean() > 0.2
+    assert not changed[foot + 20 :].any()
+    gx = np.gradient(still.mean(axis=-1), axis=1)
+    shifts = [-(gx * (m - still).mean(axis=-1)).sum() / (gx**2).sum() for m in moved]
+    assert np.abs(shifts).max() < 0.02
+
+
 def test_path_reaches_pan_and_zoom() -> None:
     spec = dataclasses.replace(SMALL, n_frames=101, path=PathSpec(pan_deg=30, zoom=2.5, jitter_px=0))
     from tests.synth.paths import CameraPath

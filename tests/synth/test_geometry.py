@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -13,8 +15,8 @@ from tests.synth.stadium import make_stadium
 from tests.synth.world import World, build_levels
 
 
-def camera(**changes: float) -> SynthCamera:
-    base = {"width": 640, "height": 360, "f_px": 900.0, "cx_px": 319.5, "cy_px": 179.5}
+def camera(**changes: Any) -> SynthCamera:
+    base: dict[str, Any] = {"width": 640, "height": 360, "f_px": 900.0, "cx_px": 319.5, "cy_px": 179.5}
     return SynthCamera(**(base | changes))
 
 

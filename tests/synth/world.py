@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from tests.synth.camera import SynthCamera
+from tests.synth.goals import draw_goals
 from tests.synth.paint import paint_rows, paint_strip
 from tests.synth.stadium import Stadium, make_stadium
 
@@ -137,8 +138,15 @@ def make_world(spec: WorldSpec, cameras: Sequence[SynthCamera]) -> World:
             ribbon,
             colours,
         )
-        rows = cv2.GaussianBlur(rows, (7, 7), PSF_PX, borderType=cv2.BORDER_REFLECT_101)
-        level0[first : first + 256] = np.clip(rows[pad0 : rows.shape[0] - pad1] + 0.5, 0, 255)
+        soft = cv2.GaussianBlur(rows, (7, 7), PSF_PX, borderType=cv2.BORDER_REFLECT_101)
+        level0[first : first + 256] = np.clip(soft[pad0 : len(rows) - pad1] + 0.5, 0, 255)
+
+    def to_texel(points: np.ndarray) -> np.ndarray:
+        horizontal = np.hypot(points[..., 0], points[..., 2])
+        lon = np.arctan2(points[..., 0], points[..., 2])
+        return np.stack([s * (lon - lon_left), s * (tan_top + points[..., 1] / horizontal)], axis=-1)
+
+    draw_goals(level0, stadium, to_texel, s)
     return World(
         levels=build_levels(level0),
         px_per_rad=s,
