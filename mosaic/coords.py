@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -67,35 +68,63 @@ def transfer_jacobian(H: FloatArray, points: FloatArray) -> FloatArray:
     return J
 
 
+@nb.njit(cache=True, nogil=True)
+def _homography_normal_equations(H, H0, src, dst, info, ridge):  # type: ignore[no-untyped-def]
+    """N (9, 9) and g (9,) of the measured points, R (9, 9) and rg (9,) of the pull to H0; see the caller."""
+    N = np.zeros((9, 9))
+    g = np.zeros(9)
+    R = np.zeros((9, 9))
+    rg = np.zeros(9)
+    J = np.zeros((2, 9))
+    for i in range(len(src)):
+        x, y = src[i, 0], src[i, 1]
+        w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+        q0 = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w
+        q1 = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w
+        w0 = H0[2, 0] * x + H0[2, 1] * y + H0[2, 2]
+        p0 = (H0[0, 0] * x + H0[0, 1] * y + H0[0, 2]) / w0
+        p1 = (H0[1, 0] * x + H0[1, 1] * y + H0[1, 2]) / w0
+        J[0, 0], J[0, 1], J[0, 2] = x / w, y / w, 1.0 / w
+        J[1, 3], J[1, 4], J[1, 5] = x / w, y / w, 1.0 / w
+        J[0, 6], J[0, 7], J[0, 8] = -q0 * x / w, -q0 * y / w, -q0 / w
+        J[1, 6], J[1, 7], J[1, 8] = -q1 * x / w, -q1 * y / w, -q1 / w
+        r0, r1 = dst[i, 0] - q0, dst[i, 1] - q1
+        for a in range(9):
+            ja0 = info[i, 0, 0] * J[0, a] + info[i, 0, 1] * J[1, a]
+            ja1 = info[i, 1, 0] * J[0, a] + info[i, 1, 1] * J[1, a]
+            g[a] += ja0 * r0 + ja1 * r1
+            rg[a] += ridge * (J[0, a] * (p0 - q0) + J[1, a] * (p1 - q1))
+            for b in range(9):
+                N[a, b] += ja0 * J[0, b] + ja1 * J[1, b]
+                R[a, b] += ridge * (J[0, a] * J[0, b] + J[1, a] * J[1, b])
+    return N, g, R, rg
+
+
 def fit_homography_to_flow(
     src: FloatArray, dst: FloatArray, info: FloatArray, H_start: FloatArray, ridge_px: float = 100.0
 ) -> tuple[FloatArray, FloatArray]:
     """Homography nearest to measured points, and the information (9, 9) on vec(H) at the solution.
 
-    src, dst: (m, 2) px; info: (m, 2, 2) px^-2 of dst. Gauss-Newton from H_start, in coordinates scaled by the
-    spread of the points. `ridge_px` is a weak pull towards H_start: the std, in px at the points, that a
-    direction without evidence keeps. Returns (H det 1, information of vec(H) of that scale, row-major).
+    src, dst: (m, 2) px; info: (m, 2, 2) px^-2 of dst. Gauss-Newton from H_start. `ridge_px` is a weak pull towards
+    H_start: the std, in px at the points, that a direction without evidence keeps. Returns (H det 1, information of
+    vec(H) of that scale, row-major).
     """
     H0 = normalise_homography(H_start)
     H = H0.copy()
     N = np.zeros((9, 9))
-    for _ in range(4):
-        J = transfer_jacobian(H, src)
-        r = dst - transfer(H, src)
-        r0 = transfer(H0, src) - transfer(H, src)
-        JW = np.einsum("nia,nij->naj", J, info)
-        N = np.einsum("naj,njb->ab", JW, J)
-        JR = np.einsum("nia,nib->ab", J, J) / (ridge_px**2)
-        g = np.einsum("naj,nj->a", JW, r) + np.einsum("nia,ni->a", J, r0) / ridge_px**2
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(N + JR), 1e-300))
-        M = (N + JR) * scale[:, None] * scale[None, :]
+    for _ in range(3):
+        N, g, R, rg = _homography_normal_equations(H, H0, src, dst, info, ridge_px**-2)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(N + R), 1e-300))
+        M = (N + R) * scale[:, None] * scale[None, :]
         # vec(H) has one free scale: a unit of curvature along H itself keeps the system regular.
         h = H.ravel() / scale
         h /= np.linalg.norm(h)
-        step = scale * np.linalg.solve(M + np.outer(h, h) + 1e-12 * np.eye(9), scale * g)
+        step = scale * np.linalg.solve(M + np.outer(h, h) + 1e-12 * np.eye(9), scale * (g + rg))
         if not np.all(np.isfinite(step)):
             break
         H = normalise_homography(H + step.reshape(3, 3))
+        if step @ (N + R) @ step < 1e-4:  # far below a tenth of its own standard deviation
+            break
     return H, N
 
 

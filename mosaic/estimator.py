@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,15 +28,16 @@ class RegisterOptions:
     """How a pair is aligned and judged.
 
     max_steps: Gauss-Newton steps per level from the finest on. stop_sigmas: a level ends when a step is below this
-    share of its own standard deviation. min_overlap, min_inliers: shares of informative pixels.
+    share of its own standard deviation (Gauss-Newton's next one would be far smaller); coarse levels only hand on. min_overlap, min_inliers: shares of informative pixels.
     score_ok, score_weak: largest median residual against that of shifted pictures. cell_floor_px: error of a cell's
     place that is not noise (crowd, codec; real-footage.md 6.3). cell_max_px: directions less certain are dropped.
-    cell_linear_px: residual flow beyond which the linearisation says nothing. correlation: variance inflation of a
+    cell_linear_px: residual flow beyond which it is no measurement, found in flow_passes local steps. correlation: variance inflation of a
     cell for residuals that are correlated between its pixels.
     """
 
     max_steps: tuple[int, ...] = (4, 5, 6, 8, 10, 10)
-    stop_sigmas: float = 0.1
+    stop_sigmas: float = 0.3
+    stop_sigmas_coarse: float = 1.0
     min_pixels: int = 60
     min_overlap: float = 0.2
     min_inliers: float = 0.4
@@ -44,6 +46,7 @@ class RegisterOptions:
     cell_floor_px: float = 0.1
     cell_max_px: float = 1.0
     cell_linear_px: float = 4.0
+    flow_passes: int = 4
     correlation: float = 4.0
     kernel: kernels.KernelName = "numba"
 
@@ -86,7 +89,8 @@ def align(
     for index in levels:
         gain, offset = _gain(source, target, state, masks, options)
         coarsest = index == levels[0] and len(levels) > 1 and index >= 2
-        result = _align_level(source, target, index, state, gain, offset, masks, not coarsest, options)
+        stop = options.stop_sigmas if index == levels[-1] else options.stop_sigmas_coarse
+        result = _align_level(source, target, index, state, gain, offset, masks, not coarsest, stop, options)
         if result is None:
             return _failed(template.frame, dst, template.size_px, "no_texture", route, n_steps), start
         state, steps, fine = result
@@ -103,7 +107,8 @@ def _gain(source: PreparedTemplate, target: Pyramid, state: Any, masks: tuple[An
     where, _, _ = source.family.warp(state, source.prepared_wide)
     index = min(template.wide_level, len(target.levels) - 1)
     seen = kernel.sample(target.levels[index], *target.scales[index], where, *masks)
-    return estimate_gain(template.wide_values, seen)
+    gain, offset = estimate_gain(template.wide_values, seen)
+    return float(gain), float(offset)
 
 
 def _evaluate(
@@ -140,6 +145,7 @@ def _align_level(
     offset: float,
     masks: tuple[Any, ...],
     tukey: bool,
+    stop_sigmas: float,
     options: RegisterOptions,
 ) -> tuple[Any, int, _Linearised] | None:
     """Steps on one level; None without texture. Accepts a step only if the robust scale does not grow."""
@@ -168,7 +174,7 @@ def _align_level(
             if damping > 100.0:
                 break
             continue
-        small = step_in_sigmas(N, step, now.scale**2) < options.stop_sigmas
+        small = step_in_sigmas(N, step, now.scale**2) < stop_sigmas
         state, now = trial_state, trial
         damping *= 0.1
         if small:
@@ -210,10 +216,11 @@ def _judge(
         return _failed(template.frame, dst, template.size_px, "few_inliers", route, n_steps, score=score)
     if score > options.score_ok:
         status, reason = PairStatus.WEAK, "score"
-    flow = _flow_grid(fine, weight, level.src_px, level.cell, options, kernel)
+    _, _, A = source.family.warp(state, source.prepared[index])
+    flow = _flow_grid(source, target, index, fine, A, gain, offset, masks, options, kernel)
     if len(flow.cell) < 6:
         return _failed(template.frame, dst, template.size_px, "no_texture", route, n_steps, score=score)
-    H, info9 = fit_homography_to_flow(flow.src_px, flow.dst_px, flow.info, _state_homography(source, state))
+    H, info9 = fit_homography_to_flow(flow.src_px, flow.dst_px, flow.info, _warp_homography(level.src_px, fine.dst))
     anchors = default_anchors(template.size_px)
     return PairFit(
         src=template.frame,
@@ -234,15 +241,12 @@ def _judge(
     )
 
 
-def _state_homography(source: PreparedTemplate, state: Any) -> FloatArray:
-    """The homography through four anchors of the family's warp: the start of the fit to the flow."""
-    anchors = default_anchors(source.template.size_px)
-    where, _, _ = source.family.warp(state, source.family.prepare(anchors))
-    if not np.all(np.isfinite(where)):
-        return np.eye(3)
-    import cv2
-
-    return cv2.getPerspectiveTransform(anchors.astype(np.float32), where.astype(np.float32)).astype(np.float64)
+def _warp_homography(src: FloatArray, dst: FloatArray) -> FloatArray:
+    """The homography closest to the family's own warp, from some of its points: start of the fit to the flow."""
+    good = np.flatnonzero(np.isfinite(dst).all(axis=1))
+    some = good[:: max(1, len(good) // 64)]
+    H, _ = cv2.findHomography(src[some], dst[some], 0)
+    return np.eye(3) if H is None else np.asarray(H, np.float64)
 
 
 _SHIFTS = np.array([[13.0, 5.0], [-13.0, -5.0], [7.0, -11.0], [-7.0, 11.0]])
@@ -275,24 +279,55 @@ def _score(
 
 
 def _flow_grid(
-    fine: _Linearised, weight: NDArray[np.float32], src: FloatArray, cell: NDArray[np.int64], options: RegisterOptions, kernel: Any
+    source: PreparedTemplate,
+    target: Pyramid,
+    index: int,
+    fine: _Linearised,
+    A: FloatArray,
+    gain: float,
+    offset: float,
+    masks: tuple[Any, ...],
+    options: RegisterOptions,
+    kernel: Any,
 ) -> FlowGrid:
-    """Residual flow per cell with its anisotropic information (real-footage.md 6.3)."""
-    A, b, S, counts = kernel.accumulate_cells(fine.residual, fine.G, weight, src, fine.dst, cell, N_CELLS)
-    keep = (S[:, 0] > 0) & (counts[:, 1] >= 6)
-    values, vectors = np.linalg.eigh(A)
-    values = np.maximum(values, 1e-12)
-    std2 = options.correlation * fine.scale**2 / values
-    known = std2 < options.cell_max_px**2
-    along = np.einsum("cji,cj->ci", vectors, b)
-    shift = np.einsum("cij,cj->ci", vectors, np.where(known, along / values, 0.0))
+    """Residual flow per cell with its anisotropic information (real-footage.md 6.3).
+
+    Several local passes, each resampled at the flow found so far: robust weights at the family's own warp would
+    down-weight just those pixels that disagree with it, and so pull the measurement towards the model (measured: half
+    of a wrong lens' flow was lost, and the focal with it).
+    """
+    level = source.template.levels[index]
+    assert level is not None
+    shift = np.zeros((N_CELLS, 2))
+    moved = fine.dst
+    residual, G = fine.residual, fine.G
+    scale = fine.scale
+    for _ in range(options.flow_passes):
+        weight = kernel.robust_weights(residual, np.float32(scale), True)
+        sums, b, S, counts = kernel.accumulate_cells(residual, G, weight, level.src_px, moved, level.cell, N_CELLS)
+        values, vectors = np.linalg.eigh(sums)
+        values = np.maximum(values, 1e-12)
+        std2 = options.correlation * scale**2 / values
+        known = std2 < options.cell_max_px**2
+        along = np.einsum("cji,cj->ci", vectors, b)
+        step = np.einsum("cij,cj->ci", vectors, np.where(known, along / values, 0.0))
+        shift = shift + np.clip(step, -1.5, 1.5)
+        moved = fine.dst + shift[level.cell]
+        residual, G = kernel.linearise(
+            target.levels[index], *target.scales[index], moved, A, level.values, level.gradients, gain, offset, *masks
+        )
+        finite = np.abs(residual[np.isfinite(residual)])
+        if len(finite) < options.min_pixels:
+            return FlowGrid.empty()
+        scale = max(1.4826 * float(np.partition(finite, len(finite) // 2)[len(finite) // 2]), 0.5)
     info = np.where(known, 1.0 / (std2 + options.cell_floor_px**2), 0.0)
-    # A shift beyond the linear range is no measurement.
-    keep &= known.any(axis=1) & (np.abs(shift).max(axis=1) <= options.cell_linear_px)
+    keep = (S[:, 0] > 0) & (counts[:, 1] >= 6) & known.any(axis=1)
+    # A shift beyond the linear range is no measurement, nor is one that still moves.
+    keep &= (np.abs(shift).max(axis=1) <= options.cell_linear_px) & (np.abs(step).max(axis=1) < 0.25)
     total = np.where(keep, S[:, 0], 1.0)[:, None]
     return FlowGrid(
         src_px=(S[:, 1:3] / total)[keep],
-        dst_px=(S[:, 3:5] / total + shift)[keep],
+        dst_px=(S[:, 3:5] / total + step)[keep],
         info=np.einsum("cij,cj,ckj->cik", vectors, info, vectors)[keep],
         weight=(counts[:, 1] / np.maximum(counts[:, 0], 1.0))[keep],
         cell=np.flatnonzero(keep),

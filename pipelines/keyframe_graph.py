@@ -1,0 +1,172 @@
+"""Focal, distortion and principal point of a shot: its keyframe pairs registered and refined in turns until they agree.
+
+A pair registered through a wrong lens measures a little of that lens; registering again with the refined one and
+refining again converges to a point that no longer depends on the start (measured: half of the error goes per round).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.records import HomographyGraph, Priors, Solution
+from calib.refine import RefineOptions, refine
+from mosaic.estimator import RegisterOptions, align
+from mosaic.pyramid import Pyramid, build_pyramid
+from mosaic.records import PairFit
+from mosaic.template import Template, prepare
+from pipelines.bridge import CameraPose, RotationZoomFamily, homography_graph, pair_state
+
+log = logging.getLogger(__name__)
+
+NEAREST, FARTHEST = 5, 5  # earlier keyframes that each one is paired with: the near ones hold, the far ones measure f
+
+
+class KeyframeImages:
+    """Gray pictures of keyframes on disk, so that a long shot does not fill the memory. Closed with the shot."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        handle, name = tempfile.mkstemp(prefix="keyframes-", suffix=".raw", dir=folder)
+        self._file, self._path = handle, Path(name)
+        self._where: dict[int, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
+        self._end = 0
+
+    def put(self, frame: int, pyramid: Pyramid) -> None:
+        """Keep the smoothed full-size level of a frame."""
+        level = np.ascontiguousarray(pyramid.levels[0])
+        os.pwrite(self._file, level.tobytes(), self._end)
+        self._where[frame] = (self._end, level.shape, level.dtype)
+        self._end += level.nbytes
+
+    def pyramid(self, frame: int, n_levels: int, mask: NDArray[np.bool_] | None) -> Pyramid:
+        """The pyramid of a kept frame, under a mask that may be newer than the frame."""
+        offset, shape, dtype = self._where[frame]
+        raw = os.pread(self._file, int(np.prod(shape)) * dtype.itemsize, offset)
+        return build_pyramid(np.frombuffer(raw, dtype).reshape(shape), n_levels=n_levels, smooth=False, mask=mask)
+
+    def close(self) -> None:
+        """Remove the file."""
+        os.close(self._file)
+        self._path.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeyframeOptions:
+    """max_rounds of registering and refining; settled: change of mean log f at which they stop. max_distance: widths
+    between two centres up to which keyframes are paired (1 - overlap)."""
+
+    max_rounds: int = 8
+    settled: float = 0.001
+    max_distance: float = 0.65
+    register: RegisterOptions = field(default_factory=RegisterOptions)
+    refine: RefineOptions = field(default_factory=RefineOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KeyframeResult:
+    """The refined keyframes with the graph they were refined on, its fits, and how many rounds it took."""
+
+    solution: Solution
+    graph: HomographyGraph
+    fits: tuple[PairFit, ...]
+    rounds: int
+
+
+def pose_of(solution: Solution, frame: int) -> CameraPose | None:
+    """A frame's camera in a solution, or None when it is not linked."""
+    rows = np.flatnonzero(solution.frames == frame)
+    if not len(rows) or not np.isfinite(solution.log_f[rows[0]]):
+        return None
+    return CameraPose(log_f=float(solution.log_f[rows[0]]), R=solution.R[rows[0]])
+
+
+def distance_in_widths(a: CameraPose, b: CameraPose, width_px: int) -> float:
+    """Displacement of a's centre in b, in widths, plus twice the log zoom ratio beyond 10 %; inf when behind."""
+    axis = b.R @ a.R[2]
+    if axis[2] <= 0.1:
+        return float("inf")
+    shift = float(np.hypot(axis[0], axis[1]) / axis[2] * np.exp(min(a.log_f, b.log_f)) / width_px)
+    return shift + 2.0 * max(0.0, abs(b.log_f - a.log_f) - 0.1)
+
+
+def refine_keyframes(
+    templates: dict[int, Template],
+    images: KeyframeImages,
+    first_fits: list[PairFit],
+    *,
+    size_px: tuple[int, int],
+    n_levels: int,
+    mask: NDArray[np.bool_] | None,
+    priors: Priors,
+    options: KeyframeOptions,
+) -> KeyframeResult:
+    """Refine from the first pass' edges, then alternate registration and refinement (at most max_rounds).
+
+    templates: keyframes by frame number. first_fits: what pass one measured among them. Never raises on bad data: the
+    solution says that it did not converge.
+    """
+    frames = sorted(templates)
+    graph = homography_graph(frames, first_fits, size_px)
+    solution = refine(graph, priors=priors, options=options.refine)
+    fits = tuple(f for f in first_fits if f.src in templates and f.dst in templates)
+    rounds = 0
+    for rounds in range(1, options.max_rounds + 1):
+        new = _register_pairs(templates, images, solution, n_levels, mask, options)
+        if not any(f.usable for f in new):
+            break
+        new_graph = homography_graph(frames, new, size_px)
+        # The first round has edges that the chain of pass one lacked: look for the optimum from scratch.
+        start = solution if rounds > 1 else None
+        refined = refine(new_graph, start=start, priors=priors, options=options.refine)
+        if not np.isfinite(refined.log_f).any():
+            break
+        change = float(np.nanmean(refined.log_f) - np.nanmean(solution.log_f))
+        solution, graph, fits = refined, new_graph, tuple(new)
+        log.debug("keyframe round %d: mean log f moved by %.5f", rounds, change)
+        if rounds > 1 and abs(change) < options.settled:
+            break
+    return KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=rounds)
+
+
+def _register_pairs(
+    templates: dict[int, Template],
+    images: KeyframeImages,
+    solution: Solution,
+    n_levels: int,
+    mask: NDArray[np.bool_] | None,
+    options: KeyframeOptions,
+) -> list[PairFit]:
+    poses = {frame: pose for frame in templates if (pose := pose_of(solution, frame)) is not None}
+    width = solution.lens.size_px[0]
+    prepared = {
+        frame: prepare(templates[frame], RotationZoomFamily(lens=solution.lens, log_f_src=pose.log_f))
+        for frame, pose in poses.items()
+    }
+    fits = []
+    for b in sorted(poses):
+        near = sorted((distance_in_widths(poses[a], poses[b], width), a) for a in poses if a < b)
+        near = [(d, a) for d, a in near if d <= options.max_distance]
+        if len(near) > NEAREST + FARTHEST:
+            near = near[:NEAREST] + near[-FARTHEST:]
+        if not near:
+            continue
+        target = images.pyramid(b, n_levels, mask)
+        levels = (2, 1, 0) if len(target.levels) > 2 else None
+        for _, a in near:
+            fit, _ = align(
+                prepared[a],
+                target,
+                pair_state(poses[a], poses[b]),
+                dst=b,
+                levels=levels,
+                options=options.register,
+                route="keyframe pair",
+            )
+            fits.append(fit)
+    return fits

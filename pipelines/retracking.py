@@ -1,0 +1,104 @@
+"""Second pass over a shot: every frame again, to keyframes whose cameras and lens are now known.
+
+The running estimate was good enough to stay locked; the refined one takes the last tenths of a pixel out of the
+warp, so that residual flow is measured where the linearisation holds. Poses come from the flow, not from the warp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.records import Solution
+from mosaic.pyramid import Pyramid
+from mosaic.records import PairFit
+from mosaic.estimator import RegisterOptions, align
+from mosaic.template import PreparedTemplate, prepare
+from pipelines.bridge import CameraPose, RotationZoomFamily, pair_state
+from pipelines.config import RegistrationOptions
+from pipelines.tracking import ShotTracker
+
+MAX_KEYFRAME_LINKS = 8
+
+
+@dataclass(slots=True, eq=False)
+class Retracker:
+    """Registers a shot's frames against its keyframes with held cameras. `approximate` has a pose for every frame."""
+
+    tracker: ShotTracker
+    approximate: Solution
+    options: RegistrationOptions
+    register_options: RegisterOptions = field(default_factory=RegisterOptions)
+    fits: list[PairFit] = field(default_factory=list)
+    _row: dict[int, int] = field(init=False)
+    _prepared: dict[int, PreparedTemplate] = field(default_factory=dict)
+    _linked: dict[int, list[int]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._row = {int(f): i for i, f in enumerate(self.approximate.frames)}
+        self._linked = {}
+        for fit in self.tracker.fits:
+            if fit.usable and fit.src in self.tracker.keyframes and fit.dst in self.tracker.keyframes:
+                self._linked.setdefault(fit.dst, []).append(fit.src)
+
+    def pose(self, frame: int) -> CameraPose | None:
+        """The approximate camera of a frame, or None where the first pass has none."""
+        row = self._row.get(frame)
+        if row is None or not np.isfinite(self.approximate.log_f[row]):
+            return None
+        return CameraPose(log_f=float(self.approximate.log_f[row]), R=self.approximate.R[row])
+
+    def step(self, frame: int, pyramid: Pyramid) -> list[PairFit]:
+        """Register one frame to its nearest keyframes (all linked ones when it is a keyframe). Returns the new fits."""
+        pose = self.pose(frame)
+        if pose is None:
+            return []
+        near = self._nearest(frame, pose)
+        if frame in self.tracker.keyframes:
+            wanted = list(dict.fromkeys([*self._linked.get(frame, []), *near]))
+            wanted = [k for k in wanted if k < frame][:MAX_KEYFRAME_LINKS]
+        else:
+            wanted = near[:2]
+        new = []
+        for index in wanted:
+            key_pose = self.pose(index)
+            if key_pose is None:
+                continue
+            fit, _ = align(
+                self._bound(index, key_pose),
+                pyramid,
+                pair_state(key_pose, pose),
+                dst=frame,
+                levels=(1, 0),
+                options=self.register_options,
+                route="refined",
+            )
+            new.append(fit)
+        self.fits.extend(new)
+        return new
+
+    def _bound(self, index: int, pose: CameraPose) -> PreparedTemplate:
+        if index not in self._prepared:
+            if len(self._prepared) > 24:
+                self._prepared.pop(next(iter(self._prepared)))
+            family = RotationZoomFamily(lens=self.approximate.lens, log_f_src=pose.log_f)
+            self._prepared[index] = prepare(self.tracker.keyframes[index].template, family)
+        return self._prepared[index]
+
+    def _nearest(self, frame: int, pose: CameraPose) -> list[int]:
+        """Keyframes by displacement in widths; at least `min_overlap` of the picture in common."""
+        found = []
+        width = self.tracker.size_px[0]
+        for index in self.tracker.keyframes:
+            other = self.pose(index)
+            if other is None or index == frame:
+                continue
+            axis = pose.R @ other.R[2]
+            if axis[2] <= 0.1:
+                continue
+            shift = float(np.hypot(axis[0], axis[1]) / axis[2] * np.exp(pose.log_f) / width)
+            distance = shift + 2.0 * max(0.0, abs(pose.log_f - other.log_f) - 0.1)
+            if distance < 1.0 - self.options.min_overlap:
+                found.append((distance, index))
+        return [index for _, index in sorted(found)]

@@ -1,0 +1,267 @@
+"""The main job: `process` takes a clip to a folder of results, shot by shot, in bounded memory.
+
+Two decoders run through the clip, the second one shot behind the first; what a shot needs in between is its
+keyframes' pixels (0.4 MB each), its pair fits, and scratch files that go with the shot.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import platform
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaic.estimator import RegisterOptions
+from mosaic.pyramid import build_pyramid
+from pipelines.archive import program_version
+from pipelines.config import Config
+from pipelines.decode import Clip, Frame, open_clip
+from pipelines.errors import InputError
+from pipelines.keyframe_graph import KeyframeImages
+from pipelines.output_folder import OutputFolder, run_digest
+from pipelines.overlays import OverlayFinder
+from pipelines.records import CameraTable, RunRecord, ShotRecord
+from pipelines.report.build import write_report
+from pipelines.shot import Timings, lost_rows, priors_of, solve_shot
+from pipelines.shot_files import thumbnail, write_shot
+from pipelines.shots import ShotSplitter, TrackedShot
+from pipelines.table import FrameFacts, concatenate
+from pipelines.tracking import ShotTracker
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int | None], None]
+PACKAGES = ("av", "kornia", "numba", "numpy", "opencv-contrib-python-headless", "scipy", "tifffile", "torch")
+
+
+def _silent(stage: str, done: int, total: int | None) -> None:
+    """No progress."""
+
+
+@dataclass(slots=True, eq=False)
+class _Job:
+    """What the two passes share (internal to this module)."""
+
+    clip: Clip
+    folder: OutputFolder
+    config: Config
+    progress: Progress
+    scratch: Path
+    finished: dict[int, tuple[ShotRecord, CameraTable]]
+    timings: Timings = field(default_factory=Timings)
+    facts: dict[int, FrameFacts] = field(default_factory=dict)
+    records: list[ShotRecord] = field(default_factory=list)
+    tables: list[CameraTable] = field(default_factory=list)
+    thumbnails: dict[int, bytes] = field(default_factory=dict)
+    images: dict[int, KeyframeImages] = field(default_factory=dict)
+    overlays: OverlayFinder | None = None
+    mask: NDArray[np.bool_] | None = None
+    n_levels: int = 4
+    second: Iterator[Frame] | None = None
+
+    def second_frames(self) -> Iterator[Frame]:
+        """The second decoding, going on where the shot before ended."""
+        if self.second is None:
+            self.second = _selected(self.clip, self.config)
+        return self.second
+
+
+def process(
+    clip: Path, out: Path, config: Config | None = None, progress: Progress | None = None, resume: bool = False
+) -> RunRecord:
+    """Run everything on one clip and write OUT (README: what a run writes).
+
+    Returns the record that run.json holds. Raises InputError, ConfigError, OutputError for a user's mistakes; earlier
+    outputs in OUT stay whole until the new ones are.
+    """
+    config = config or Config()
+    started = time.perf_counter()
+    cv2.setNumThreads(config.run.threads or 2)
+    with (
+        open_clip(clip, config.decode) as opened,
+        OutputFolder(out, run_digest(config, opened.facts.identity()), resume=resume) as folder,
+        tempfile.TemporaryDirectory(prefix=".scratch-", dir=folder.staging) as scratch,
+    ):
+        finished = {record.index: (record, rows) for record, rows in folder.finished_shots()}
+        job = _Job(
+            clip=opened,
+            folder=folder,
+            config=config,
+            progress=progress or _silent,
+            scratch=Path(scratch),
+            finished=finished,
+            n_levels=config.registration.levels + (1 if opened.facts.size_px[0] > 1600 else 0),
+        )
+        if config.overlays.enabled:
+            job.overlays = OverlayFinder(opened.facts.size_px, config.overlays)
+        _first_pass(job)
+        table = _whole_table(job)
+        folder.write_camera(table, parquet=config.output.parquet)
+        job.timings.seconds["total"] = time.perf_counter() - started
+        record = _record(job, opened)
+        _close(job)
+        with job.timings.measure("report"):
+            write_report(folder.staging, record, table, job.thumbnails)
+        scratch_folder = Path(scratch)
+        for left in scratch_folder.iterdir():
+            left.unlink()
+        folder.publish(record)
+    return record
+
+
+def _selected(clip: Clip, config: Config) -> Iterator[Frame]:
+    """The configured range of pictures."""
+    stop = None if config.run.max_frames is None else config.run.start_frame + config.run.max_frames
+    return itertools.islice(iter(clip), config.run.start_frame, stop)
+
+
+def _first_pass(job: _Job) -> None:
+    """Decode, register, split into shots; each finished shot is solved and written at once."""
+    config, size_px = job.config, job.clip.facts.size_px
+    register = RegisterOptions(kernel=config.registration.kernel)
+
+    def new_tracker() -> ShotTracker:
+        tracker = ShotTracker(size_px, config.registration, priors_of(config, size_px), register_options=register)
+        tracker.images = KeyframeImages(job.scratch)
+        job.images[id(tracker)] = tracker.images
+        return tracker
+
+    splitter = ShotSplitter(new_tracker, config.shots.bridge_frames)
+    frames = _selected(job.clip, config)
+    expected = job.clip.facts.n_frames_header if config.run.max_frames is None else config.run.max_frames
+    count = 0
+    while True:
+        with job.timings.measure("decode"):
+            frame = next(frames, None)
+        if frame is None:
+            break
+        count += 1
+        _note(job, frame)
+        with job.timings.measure("register"):
+            pyramid = build_pyramid(frame.gray, n_levels=job.n_levels, mask=job.mask)
+            done = list(splitter.push(frame.index, frame.pts_s, pyramid))
+        if job.overlays is not None:
+            with job.timings.measure("overlays"):
+                motion = splitter.last_motion_px
+                if np.isfinite(motion):
+                    job.overlays.update(frame.gray, motion)
+                if count % 10 == 0:
+                    job.mask = job.overlays.mask()
+        for shot in done:
+            _finish(job, shot)
+        job.progress("first pass", count, expected)
+    if count == 0:
+        raise InputError(job.clip.facts.path, "no picture in the chosen range", "lower run.start_frame")
+    for shot in splitter.finish():
+        _finish(job, shot)
+
+
+def _note(job: _Job, frame: Frame) -> None:
+    job.facts[frame.index] = FrameFacts(
+        frame=frame.index,
+        pts_s=frame.pts_s,
+        timecode=frame.timecode,
+        source_frame=frame.source_frame,
+        field=frame.field,
+        status="ok",
+        reason="",
+    )
+
+
+def _finish(job: _Job, tracked: TrackedShot) -> None:
+    """Solve and write one shot, or say that it is too short to be one."""
+    tracker = tracked.tracker
+    images = tracker.images
+    assert images is not None
+    if len(tracker.observations) < job.config.shots.min_frames:
+        images.close()
+        return  # its frames belong to no shot; _whole_table says so
+    index = len(job.records)
+    facts = {
+        o.frame: FrameFacts(
+            frame=o.frame,
+            pts_s=o.pts_s,
+            timecode=job.facts[o.frame].timecode,
+            source_frame=job.facts[o.frame].source_frame,
+            field=job.facts[o.frame].field,
+            status=o.status,
+            reason=o.reason,
+        )
+        for o in tracker.observations
+    }
+    first, last = tracker.observations[0].frame, tracker.observations[-1].frame
+    known = job.finished.get(index)
+    if known is not None and (known[0].first_frame, known[0].last_frame) == (first, last):
+        record, rows = known
+        log.info("shot %d kept from the interrupted run", index)
+    else:
+        mask = job.overlays.mask() if job.overlays is not None else None
+        solved = solve_shot(
+            tracker, facts, index, job.second_frames, images=images, mask=mask, n_levels=job.n_levels,
+            config=job.config, scratch=job.scratch, progress=job.progress,
+        )  # fmt: skip
+        with solved.timings.measure("write"):
+            record = write_shot(job.folder, index, tracker, solved, job.config)
+        rows = solved.rows
+        for stage, seconds in solved.timings.seconds.items():
+            job.timings.seconds[stage] = job.timings.seconds.get(stage, 0.0) + seconds
+        job.folder.save_shot(record, rows)
+    picture = thumbnail(tracker)
+    if picture is not None:
+        job.thumbnails[record.reference_frame] = picture
+    images.close()
+    job.images.pop(id(tracker), None)
+    job.records.append(record)
+    job.tables.append(rows)
+
+
+def _whole_table(job: _Job) -> CameraTable:
+    """All pictures of the clip, those outside every shot as 'lost' with a reason."""
+    seen = {int(f) for table in job.tables for f in table.frame}
+    left = [job.facts[f] for f in sorted(job.facts) if f not in seen]
+    tables = list(job.tables)
+    if left:
+        tables.append(lost_rows(left, "between_shots"))
+    return concatenate(tables)
+
+
+def _record(job: _Job, clip: Clip) -> RunRecord:
+    levelled = [r for r in job.records if r.calibration.get("level", {}).get("observable")]
+    if not job.records:
+        world = "none"
+    elif len(levelled) == len(job.records):
+        world = "levelled head frame of each shot"
+    elif levelled:
+        world = "levelled head frame where calibration.level says observable, else the reference camera"
+    else:
+        world = "reference camera of each shot"
+    versions = {"broadcast-mosaic": program_version(), "python": platform.python_version()}
+    versions |= {name: metadata.version(name) for name in PACKAGES}
+    extra = {"overlays": job.overlays.facts()} if job.overlays is not None else {}
+    return RunRecord(
+        versions=versions,
+        config=job.config.as_dict(),
+        clip={**clip.facts.as_dict(), "identity": clip.facts.identity(), "n_frames_decoded": len(job.facts)},
+        shots=tuple(job.records),
+        timings_s=dict(job.timings.seconds),
+        world=world,
+        warnings=tuple(clip.facts.warnings),
+        complete=all(r.status != "failed" for r in job.records) and bool(job.records),
+        extra=extra,
+    )
+
+
+def _close(job: _Job) -> None:
+    """Let go of what unfinished trackers left open."""
+    for images in job.images.values():
+        images.close()
+    job.images.clear()

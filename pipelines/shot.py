@@ -1,0 +1,388 @@
+"""One shot from its first pass to its rows: keyframes refined, frames registered again, poses, verdict, panorama.
+
+The order of the second half of the main job. What each step computes lives in its own module.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.gates import GateOptions, judge
+from calib.level import level
+from calib.poses import solve_poses
+from calib.records import Level, Priors, Solution, Verdict
+from calib.refine import RefineOptions, refine
+from mosaic.composite import Panorama, composite
+from mosaic.framestore import FrameStore
+from mosaic.pyramid import build_pyramid
+from mosaic.records import MotionGraph, PairFit
+from mosaic.surface import Surface, choose_surface
+from mosaic.views import CompositeOptions, ViewPlan, plan_views
+from pipelines.bridge import CameraPlacement, CameraPose, homography_graph
+from pipelines.config import Config
+from pipelines.decode import Frame
+from pipelines.keyframe_graph import KeyframeImages, KeyframeOptions, KeyframeResult, refine_keyframes
+from pipelines.records import CameraTable
+from pipelines.retracking import Retracker
+from pipelines.table import FrameFacts, blank_rows, concatenate, shot_rows
+from pipelines.tracking import Observation, ShotTracker
+
+log = logging.getLogger(__name__)
+
+MAX_PLACEMENTS_FOR_SURFACE = 400
+
+
+@dataclass(slots=True)
+class Timings:
+    """Seconds per stage, added up."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def measure(self, stage: str) -> _Stopwatch:
+        """`with timings.measure('stage'):` adds the elapsed wall time."""
+        return _Stopwatch(self, stage)
+
+
+@dataclass(slots=True)
+class _Stopwatch:
+    timings: Timings
+    stage: str
+    started: float = 0.0
+
+    def __enter__(self) -> None:
+        self.started = time.perf_counter()
+
+    def __exit__(self, *error: object) -> None:
+        elapsed = time.perf_counter() - self.started
+        self.timings.seconds[self.stage] = self.timings.seconds.get(self.stage, 0.0) + elapsed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CalibratedShot:
+    """A shot with its cameras: everything that rows, panorama, files and the shot's record are made from."""
+
+    solution: Solution
+    verdict: Verdict
+    level: Level
+    keyframes: KeyframeResult
+    graph: MotionGraph
+    rows: CameraTable
+    panorama: Panorama | None
+    no_panorama: str
+    timings: Timings
+
+
+def solve_shot(
+    tracker: ShotTracker,
+    facts: Mapping[int, FrameFacts],
+    shot: int,
+    frames: Callable[[], Iterator[Frame]],
+    *,
+    images: KeyframeImages,
+    mask: NDArray[np.bool_] | None,
+    n_levels: int,
+    config: Config,
+    scratch: Path,
+    progress: Callable[[str, int, int | None], None],
+) -> CalibratedShot:
+    """Second half of the job for one shot.
+
+    facts: per frame number. frames: starts (or goes on with) a second decoding of the clip that will reach the shot's
+    frames. mask: usable pixels, as known at the shot's end. Raises only on mistakes; bad footage is a verdict.
+    """
+    timings = Timings()
+    priors, refine_options = priors_of(config, tracker.size_px), refine_options_of(config)
+    with timings.measure("keyframes"):
+        result = refine_keyframes(
+            {k: key.template for k, key in tracker.keyframes.items()},
+            images,
+            [f for f in tracker.fits if f.src in tracker.keyframes and f.dst in tracker.keyframes],
+            size_px=tracker.size_px,
+            n_levels=n_levels,
+            mask=mask,
+            priors=priors,
+            options=KeyframeOptions(refine=refine_options, register=tracker.register_options),
+        )
+        result = _with_central_reference(result, priors, refine_options)
+        verdict = judge(result.solution, result.graph, GateOptions(refine=refine_options, coherent_gain=0.5))
+        head = level(result.solution)
+    with timings.measure("poses"):
+        approximate = _poses(tracker, result, tracker.fits)
+    shot_facts = [facts[o.frame] for o in tracker.observations]
+    usable = config.panorama.enabled and np.isfinite(approximate.log_f).sum() >= 1
+    if not usable:
+        rows = shot_rows(
+            shot=shot, facts=shot_facts, solution=approximate, verdict=verdict, level=head, fits=tracker.fits
+        )
+        why = "switched off" if not config.panorama.enabled else "no frame has a camera"
+        return CalibratedShot(
+            solution=approximate, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, tracker.fits),
+            rows=rows, panorama=None, no_panorama=why, timings=timings,
+        )  # fmt: skip
+
+    world = head.R_head_world if head.observable else np.eye(3)
+    options = CompositeOptions(views=config.panorama.views)
+    with timings.measure("plan"):
+        surface, plan = _plan(approximate, tracker, world, config, options)
+    store = FrameStore(scratch, tracker.size_px)
+    try:
+        fits = _second_pass(
+            tracker, approximate, frames(), plan, store, mask, n_levels, config, timings, progress
+        )
+        with timings.measure("poses"):
+            solution = _poses(tracker, result, [*fits, *_steps(tracker)])
+        with timings.measure("composite"):
+            placements = placements_of(solution, world, tracker.observations, tracker.size_px)
+            panorama = composite(
+                plan, store, placements, surface, options, scratch=scratch,
+                progress=lambda share: progress("composite", round(share * 100), 100),
+            )  # fmt: skip
+    finally:
+        store.close()
+    rows = shot_rows(shot=shot, facts=shot_facts, solution=solution, verdict=verdict, level=head, fits=fits)
+    return CalibratedShot(
+        solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
+        rows=rows, panorama=panorama, no_panorama="", timings=timings,
+    )  # fmt: skip
+
+
+def priors_of(config: Config, size_px: tuple[int, int]) -> Priors:
+    """calib's priors from what the user knows. A known focal needs a frame: see `known_focal`."""
+    o = config.calibration
+    return Priors(
+        c0_std=0.05 if o.distortion else 1e-6,
+        pp_std_x=1e-6 if o.fix_pp else Priors().pp_std_x,
+        pp_std_y=1e-6 if o.fix_pp else Priors().pp_std_y,
+    )
+
+
+def refine_options_of(config: Config) -> RefineOptions:
+    """calib's refinement options from the configuration."""
+    return RefineOptions(distortion=config.calibration.distortion, free_pp=not config.calibration.fix_pp)
+
+
+def placements_of(
+    solution: Solution,
+    R_surface_world: NDArray[np.float64],
+    observations: Sequence[Observation],
+    size_px: tuple[int, int],
+) -> list[CameraPlacement]:
+    """Placements of all solved frames, in the panorama's axes; half a frame's motion counts as blur."""
+    motion = {o.frame: o.motion_px for o in observations}
+    return [
+        CameraPlacement(
+            frame=int(frame),
+            size_px=size_px,
+            lens=solution.lens,
+            pose=CameraPose(log_f=float(log_f), R=R @ R_surface_world.T),
+            blur_px=float(np.nan_to_num(motion.get(int(frame), 0.0), nan=0.0)) * 0.5,
+        )
+        for frame, log_f, R in zip(solution.frames, solution.log_f, solution.R, strict=True)
+        if np.isfinite(log_f) and int(frame) in motion
+    ]
+
+
+def _with_central_reference(result: KeyframeResult, priors: Priors, options: RefineOptions) -> KeyframeResult:
+    """The same keyframes in the axes of the one nearest to the middle of the motion.
+
+    A planar panorama about the end of a pan is all foreshortening, and homographies to it are long.
+    """
+    solution = result.solution
+    known = np.flatnonzero(np.isfinite(solution.log_f))
+    if len(known) < 2:
+        return result
+    axes = solution.R[known, 2, :]
+    middle = axes.mean(axis=0)
+    central = int(solution.frames[known[int(np.argmax(axes @ middle))]])
+    if central == solution.reference:
+        return result
+    refined = refine(
+        result.graph, start=solution.with_reference(central), priors=priors, options=replace(options, reference=central)
+    )
+    return replace(result, solution=refined) if np.isfinite(refined.log_f).any() else result
+
+
+def _poses(tracker: ShotTracker, result: KeyframeResult, fits: Sequence[PairFit]) -> Solution:
+    """Every frame against the held keyframes. A shot of one keyframe keeps its prior focal and is never claimed."""
+    held = result.solution
+    frames = [o.frame for o in tracker.observations if o.status != "lost" and o.reason != "duplicate"]
+    if not np.isfinite(held.log_f).any():
+        held = _prior_only(held, tracker)
+    between = [f for f in fits if not (f.src in tracker.keyframes and f.dst in tracker.keyframes)]
+    graph = homography_graph(frames, between, tracker.size_px)
+    solved = solve_poses(graph, held)
+    return _with_duplicates(solved, tracker)
+
+
+def _prior_only(solution: Solution, tracker: ShotTracker) -> Solution:
+    """The first keyframe at the prior focal, as the thing that other frames are related to."""
+    row = solution.index(solution.reference)
+    log_f = solution.log_f.copy()
+    log_f[row] = solution.priors.log_f_mean + np.log(tracker.size_px[0])
+    R = solution.R.copy()
+    R[row] = np.eye(3)
+    return replace(solution, log_f=log_f, R=R)
+
+
+def _with_duplicates(solution: Solution, tracker: ShotTracker) -> Solution:
+    """Repeated pictures get the camera of the picture that they repeat."""
+    order = [o.frame for o in tracker.observations]
+    row = {int(f): i for i, f in enumerate(solution.frames)}
+    source: list[int] = []
+    kept: list[int] = []
+    last: int | None = None
+    for o in tracker.observations:
+        if o.frame in row:
+            last = row[o.frame]
+        elif o.reason != "duplicate" or last is None:
+            continue
+        kept.append(o.frame)
+        source.append(last if last is not None else row[order[0]])
+    pick = np.array(source)
+    return replace(
+        solution,
+        frames=np.array(kept),
+        log_f=solution.log_f[pick],
+        R=solution.R[pick],
+        sigma_log_f=solution.sigma_log_f[pick],
+        sigma_log_zoom=solution.sigma_log_zoom[pick],
+        cov_rot=solution.cov_rot[pick],
+        rms_px=solution.rms_px[pick],
+    )
+
+
+def _steps(tracker: ShotTracker) -> list[PairFit]:
+    """Frame-to-frame pairs of the first pass: they keep the track smooth where the keyframe changes."""
+    order = [o.frame for o in tracker.observations if o.reason != "duplicate"]
+    before = dict(zip(order[1:], order[:-1], strict=True))
+    return [f for f in tracker.fits if f.usable and before.get(f.dst) == f.src and f.route != "composed"]
+
+
+def _plan(
+    solution: Solution,
+    tracker: ShotTracker,
+    world: NDArray[np.float64],
+    config: Config,
+    options: CompositeOptions,
+) -> tuple[Surface, ViewPlan]:
+    placements = placements_of(solution, world, tracker.observations, tracker.size_px)
+    stride = max(1, len(placements) // MAX_PLACEMENTS_FOR_SURFACE)
+    surface = choose_surface(
+        placements[::stride], config.panorama.projection, max_pixels=config.panorama.max_megapixels * 1e6
+    )
+    return surface, plan_views(placements, surface, options)
+
+
+def _second_pass(
+    tracker: ShotTracker,
+    approximate: Solution,
+    frames: Iterator[Frame],
+    plan: ViewPlan,
+    store: FrameStore,
+    mask: NDArray[np.bool_] | None,
+    n_levels: int,
+    config: Config,
+    timings: Timings,
+    progress: Callable[[str, int, int | None], None],
+) -> list[PairFit]:
+    """Decode the shot again: register every frame to refined keyframes, and keep the pictures of the plan."""
+    wanted = {o.frame for o in tracker.observations if o.reason != "duplicate"}
+    first, last = tracker.observations[0].frame, tracker.observations[-1].frame
+    planned = set(plan.frames)
+    retracker = Retracker(
+        tracker=tracker, approximate=approximate, options=config.registration, register_options=tracker.register_options
+    )
+    while True:
+        with timings.measure("decode again"):
+            frame = next(frames, None)
+        if frame is None:
+            break
+        if frame.index < first:
+            continue
+        if frame.index in wanted:
+            with timings.measure("register again"):
+                retracker.step(frame.index, build_pyramid(frame.gray, n_levels=n_levels, mask=mask))
+        if frame.index in planned:
+            with timings.measure("keep views"):
+                store.put(frame.index, frame.picture(), mask)
+        progress("second pass", frame.index - first + 1, last - first + 1)
+        if frame.index >= last:
+            break
+    return retracker.fits
+
+
+def _graph(tracker: ShotTracker, fits: Sequence[PairFit]) -> MotionGraph:
+    return MotionGraph(
+        frames=np.array([o.frame for o in tracker.observations], np.int64), fits=tuple(fits), size_px=tracker.size_px
+    )
+
+
+def lost_rows(facts: Sequence[FrameFacts], reason: str) -> CameraTable:
+    """Rows of frames that belong to no shot."""
+    return blank_rows(facts, -1, "lost", reason)
+
+
+__all__ = [
+    "CalibratedShot",
+    "Timings",
+    "concatenate",
+    "lost_rows",
+    "placements_of",
+    "priors_of",
+    "refine_options_of",
+    "solve_shot",
+]
+
+
+def calibration_facts(shot: CalibratedShot, tracker: ShotTracker) -> dict[str, Any]:
+    """What run.json says about a shot's calibration. JSON-ready but for numpy scalars and NaN."""
+    solution, verdict, head = shot.keyframes.solution, shot.verdict, shot.level
+    reasons: dict[str, int] = {}
+    for fit in tracker.fits:
+        key = str(fit.status) if fit.usable else f"{fit.status}: {fit.reason}"
+        reasons[key] = reasons.get(key, 0) + 1
+    residual = shot.solution.rms_px[np.isfinite(shot.solution.rms_px)]
+    return {
+        "claims_focal": verdict.claims_focal,
+        "reason": verdict.reason,
+        "sentence": verdict.sentence,
+        "sigma_relative": verdict.sigma_log_f_total,
+        "sigma_parts": dict(verdict.sigma_parts),
+        "s10_px": verdict.s10_px,
+        "chi2_dof": verdict.chi2_dof,
+        "rotation_deg": verdict.rotation_deg,
+        "zoom_range": verdict.zoom_range,
+        "support_rows": verdict.support_rows,
+        "flags": list(verdict.flags),
+        "lens": {
+            "pp_px": solution.lens.pp_px.tolist(),
+            "aspect": solution.lens.aspect,
+            "k1_half_c0": solution.lens.c0,
+            "k1_half_c1": solution.lens.c1,
+            "std": dict(solution.lens_std),
+        },
+        "level": {
+            "observable": head.observable,
+            "reason": head.reason,
+            "sentence": head.sentence,
+            "tilt0_deg": float(np.degrees(head.tilt0_rad)),
+            "rho_deg": float(np.degrees(head.rho_rad)),
+            "tilt0_std_deg": float(np.degrees(head.tilt0_std_rad)),
+            "rho_std_deg": float(np.degrees(head.rho_std_rad)),
+        },
+        "keyframes": [int(k) for k in sorted(tracker.keyframes)],
+        "keyframe_pairs": len(shot.keyframes.fits),
+        "keyframe_pairs_usable": sum(f.usable for f in shot.keyframes.fits),
+        "rounds": shot.keyframes.rounds,
+        "converged": solution.converged,
+        "first_pass_pairs": reasons,
+        "residual_median_px": float(np.median(residual)) if len(residual) else float("nan"),
+    }

@@ -1,0 +1,177 @@
+"""The files of one shot's folder and its record: panorama in all its forms, pairs.npz, thumbnail."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calib import rotation
+from mosaic.composite import Panorama
+from pipelines.archive import to_json, write_arrays
+from pipelines.bridge import CameraPlacement
+from pipelines.config import Config
+from pipelines.exports.panorama_jpeg import write_panorama_jpeg
+from pipelines.exports.panorama_json import write_panorama_json
+from pipelines.exports.panorama_tiff import write_panorama_tiff
+from pipelines.exports.pto import PtoFrame, write_pto
+from pipelines.output_folder import OutputFolder
+from pipelines.records import ShotRecord
+from pipelines.shot import CalibratedShot, calibration_facts
+from pipelines.table import status_counts
+from pipelines.tracking import ShotTracker
+
+OUTLINES = 200  # frames whose outline the report can draw
+
+
+def write_shot(
+    folder: OutputFolder, index: int, tracker: ShotTracker, shot: CalibratedShot, config: Config
+) -> ShotRecord:
+    """Stage OUT/shot-NNN/ and return the shot's record."""
+    name = f"shot-{index:03d}"
+    files = [f"{name}/pairs.npz"]
+    write_arrays(folder.stage(files[0]), pair_arrays(shot))
+    panorama: dict[str, Any] | None = None
+    if shot.panorama is not None:
+        files += write_panorama(folder, name, shot, config)
+        panorama = panorama_facts(shot.panorama)
+        shot.panorama.release()
+    rows = shot.rows
+    counts = status_counts(rows)
+    solved = np.isfinite(rows.zoom_ratio)
+    claimed = np.isfinite(rows.f_px)
+    focal = None
+    if claimed.any():
+        focal = {
+            "min_px": float(rows.f_px[claimed].min()),
+            "max_px": float(rows.f_px[claimed].max()),
+            "median_std_px": float(np.median(rows.f_std_px[claimed])),
+            "median_relative_std": float(np.median(rows.f_std_px[claimed] / rows.f_px[claimed])),
+        }
+    if not solved.any():
+        status, reason, sentence = "failed", "not_linked", "No frame of the shot could be registered to another."
+    elif focal is None:
+        status, reason, sentence = "relative", shot.verdict.reason, shot.verdict.sentence
+    else:
+        status, reason, sentence = "ok", "", shot.verdict.sentence
+    return ShotRecord(
+        index=index,
+        first_frame=int(rows.frame[0]),
+        last_frame=int(rows.frame[-1]),
+        reference_frame=int(shot.solution.reference),
+        status=status,
+        reason=reason,
+        sentence=sentence,
+        focal=focal,
+        calibration=to_json(calibration_facts(shot, tracker)),
+        panorama=to_json(panorama),
+        files=tuple(files),
+        status_counts=counts,
+        timings_s=dict(shot.timings.seconds),
+        warnings=() if shot.panorama is not None else (f"no panorama: {shot.no_panorama}",),
+    )
+
+
+def pair_arrays(shot: CalibratedShot) -> dict[str, Any]:
+    """pairs.npz: every pair of the shot's graph, row by row; flow grids in one long array with `flow_start` offsets."""
+    fits = shot.graph.fits
+    counts = np.array([len(f.flow.cell) for f in fits], np.int64)
+    return {
+        "src": np.array([f.src for f in fits], np.int64),
+        "dst": np.array([f.dst for f in fits], np.int64),
+        "H_dst_src": np.array([f.H_dst_src for f in fits]).reshape(-1, 3, 3),
+        "status": np.array([str(f.status) for f in fits], "U8"),
+        "reason": np.array([f.reason for f in fits], "U16"),
+        "route": np.array([f.route for f in fits], "U24"),
+        "overlap": np.array([f.overlap for f in fits]),
+        "rms_grey": np.array([f.rms_grey for f in fits]),
+        "score": np.array([f.score for f in fits]),
+        "gain": np.array([f.gain for f in fits]),
+        "offset": np.array([f.offset for f in fits]),
+        "anchors_px": np.array([f.anchors_px for f in fits]).reshape(-1, 4, 2),
+        "info": np.array([f.info for f in fits], np.float32).reshape(-1, 8, 8),
+        "flow_start": np.concatenate([[0], np.cumsum(counts)]),
+        "flow_cell": np.concatenate([f.flow.cell for f in fits]) if fits else np.zeros(0, np.int64),
+        "flow_src_px": np.concatenate([f.flow.src_px for f in fits]) if fits else np.zeros((0, 2)),
+        "flow_dst_px": np.concatenate([f.flow.dst_px for f in fits]) if fits else np.zeros((0, 2)),
+        "flow_info": np.concatenate([f.flow.info for f in fits]).astype(np.float32) if fits else np.zeros((0, 2, 2)),
+        "size_px": np.array(shot.graph.size_px, np.int64),
+    }
+
+
+def panorama_facts(panorama: Panorama) -> dict[str, Any]:
+    """What run.json and the report need of a panorama; outlines of frames in panorama pixels."""
+    surface = panorama.surface
+    frames = sorted(panorama.placements)
+    stride = max(1, len(frames) // OUTLINES)
+    outlines = {}
+    for frame in frames[::stride]:
+        placement = panorama.placements[frame]
+        w, h = placement.size_px
+        corners = np.array([[0, 0], [w - 1, 0], [w - 1, h - 1], [0, h - 1]], float)
+        border = np.concatenate(
+            [corners[i] + np.linspace(0, 1, 6, endpoint=False)[:, None] * (corners[(i + 1) % 4] - corners[i]) for i in range(4)]
+        )
+        pixels = panorama.frame_to_pixel(frame, border)
+        if np.isfinite(pixels).all():
+            outlines[str(frame)] = np.round(pixels, 1).tolist()
+    return {
+        "projection": surface.kind,
+        "size_px": [surface.width, surface.height],
+        "scale_px": surface.scale_px,
+        "cx": surface.cx,
+        "cy": surface.cy,
+        "frames": len(panorama.frames),
+        "seen_share": float((np.asarray(panorama.alpha) > 0).mean()),
+        "outlines": outlines,
+    }
+
+
+def thumbnail(tracker: ShotTracker) -> bytes | None:
+    """A small gray JPEG of the shot's middle keyframe for the report."""
+    keys = sorted(tracker.keyframes)
+    small = tracker.keyframes[keys[len(keys) // 2]].small
+    width = 240
+    picture = cv2.resize(small, (width, max(1, round(small.shape[0] * width / small.shape[1]))), interpolation=cv2.INTER_AREA)
+    good, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return data.tobytes() if good else None
+
+
+def write_panorama(folder: OutputFolder, name: str, shot: CalibratedShot, config: Config) -> list[str]:
+    """Stage panorama.tif, .jpg, .json and .pto of a shot; returns the names written."""
+    panorama = shot.panorama
+    assert panorama is not None  # the caller asked
+    world = "levelled: y along the pan axis" if shot.level.observable else "reference camera"
+    if not shot.verdict.claims_focal:
+        world += "; the focal length is not known, so rays are relative to a nominal one"
+    names = [f"{name}/panorama.{kind}" for kind in ("tif", "jpg", "json", "pto")]
+    paths = [folder.stage(n) for n in names]
+    write_panorama_tiff(panorama, paths[0], threads=2)
+    write_panorama_jpeg(panorama, paths[1], max_width_px=config.output.jpeg_max_width)
+    write_panorama_json(panorama, paths[2], world=world)
+    write_pto(paths[3], panorama.surface, pto_frames(panorama))
+    return names
+
+
+def pto_frames(panorama: Panorama) -> list[PtoFrame]:
+    """The composited frames as Hugin cameras. The file names are those an extraction of the frames would have."""
+    frames = []
+    for frame in panorama.frames:
+        placement = panorama.placements[frame]
+        assert isinstance(placement, CameraPlacement)
+        pan, tilt, roll = rotation.to_pan_tilt_roll(placement.pose.R)
+        frames.append(
+            PtoFrame(
+                name=f"frame_{frame:06d}.png",
+                size_px=placement.size_px,
+                f_px=placement.px_per_rad,
+                pan_rad=float(pan),
+                tilt_rad=float(tilt),
+                roll_rad=float(roll),
+                cx_px=float(placement.lens.pp_px[0]),
+                cy_px=float(placement.lens.pp_px[1]),
+                k1=float(placement.lens.k1_opencv(placement.pose.log_f)),
+            )
+        )
+    return frames
