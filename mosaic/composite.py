@@ -25,15 +25,13 @@ from mosaic.surface import Placement, Surface
 from mosaic.views import (
     CompositeOptions,
     Lattice,
-    Rating,
     ViewPlan,
     centrality,
-    crowd_level,
     lattice_of,
     plan_views,
     rate_views,
     resolution,
-    select_views,
+    share_views,
 )
 
 __all__ = ["CompositeOptions", "FrameStore", "Panorama", "ViewPlan", "composite", "plan_views"]
@@ -124,9 +122,8 @@ class _Scene:
     views: tuple[Placement, ...]
     gains: NDArray[np.float32]  # (n, 3)
     lattice: Lattice
-    quality: NDArray[np.float32]  # (n, ny, nx)
     floor: NDArray[np.float64]  # (ny, nx)
-    crowd: NDArray[np.float32]  # (ny, nx)
+    member: NDArray[np.bool_]  # (n, ny, nx)
     options: CompositeOptions
 
 
@@ -154,13 +151,11 @@ def composite(
         if k in store and k in by_frame and np.isfinite(by_frame[k].px_per_rad)
     ]
     lattice = lattice_of(surface)
-    views, rating = _final_views(stored, lattice, options)
+    views, floor, member = _final_views(stored, lattice, surface, options)
     gains = solve_gains(store, views, surface) if options.gains else np.ones((len(views), 3))
-    grid_shape = (len(lattice.y_px), len(lattice.x_px))
     scene = _Scene(
         surface=surface, store=store, views=views, gains=gains.astype(np.float32), lattice=lattice,
-        quality=rating.quality.reshape(-1, *grid_shape), floor=rating.floor.reshape(grid_shape),
-        crowd=crowd_level(views, lattice, rating.floor, options).reshape(grid_shape), options=options,
+        floor=floor.reshape(member.shape[1:]), member=member, options=options,
     )  # fmt: skip
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     size = (surface.height, surface.width)
@@ -195,18 +190,17 @@ def composite(
 
 
 def _final_views(
-    stored: Sequence[Placement], lattice: Lattice, options: CompositeOptions
-) -> tuple[tuple[Placement, ...], Rating]:
-    """The plan again with final placements: what approximate ones asked for beyond K views is not warped."""
+    stored: Sequence[Placement], lattice: Lattice, surface: Surface, options: CompositeOptions
+) -> tuple[tuple[Placement, ...], NDArray[np.float64], NDArray[np.bool_]]:
+    """Views in use, the resolution floor (p,) and which view counts where (n, ny, nx), with the final placements."""
     if not stored:
         raise ValueError("no stored frame has a placement: nothing to composite")
     rating = rate_views(stored, lattice, options)
-    chosen, _, _ = select_views(rating, stored, options)
-    if not chosen:
+    member = share_views(stored, rating, lattice, surface.scale_px, options)
+    used = np.flatnonzero(member.any(axis=(1, 2)) & rating.quality.any(axis=1))
+    if not len(used):
         raise ValueError(f"none of {len(stored)} stored frames sees the panorama")
-    order = sorted(chosen, key=lambda i: stored[i].frame)
-    kept = Rating(quality=rating.quality[order], floor=rating.floor, rare=rating.rare[order])
-    return tuple(stored[i] for i in order), kept
+    return tuple(stored[int(i)] for i in used), rating.floor, member[used]
 
 
 def _tile(
@@ -241,9 +235,9 @@ def _tile_maps(
 ) -> list[tuple[int, NDArray[np.float32], int, int]]:
     """(view, grid (rows, columns, 3), step, shrink) of the views that count in a tile, heaviest max_views of them."""
     near = _lattice_box(scene.lattice, x0, y0, width, height)
-    candidates = np.flatnonzero(scene.quality[(slice(None), *near)].any(axis=(1, 2)))
+    candidates = np.flatnonzero(scene.member[(slice(None), *near)].any(axis=(1, 2)))
     rays, checks = _tile_rays(scene.surface, x0, y0, width, height, GRID_PX)
-    floor, crowd = _interpolate(scene, rays.shape[:2], x0, y0)
+    at = _lattice_at(scene.lattice, rays.shape[:2], x0, y0, GRID_PX)
     found = []
     for index in candidates:
         placement = scene.views[index]
@@ -256,10 +250,10 @@ def _tile_maps(
                 xy = placement.ray_to_pixel(finer)
                 if _grid_error(xy, placement.ray_to_pixel(finer_checks)) <= MAP_ERROR_PX:
                     break
-        level, least = (floor, crowd) if step == GRID_PX else _interpolate(scene, xy.shape[:2], x0, y0, step)
+        here = at if step == GRID_PX else _lattice_at(scene.lattice, xy.shape[:2], x0, y0, step)
         central = centrality(xy, placement.size_px, scene.options.margin_px)
-        crowded = np.clip((central / np.maximum(least, 1e-6) - 0.7) / 0.3, 0.0, 1.0)
-        sharp = _sharpness(resolution(placement), level) * np.where(least > 0, crowded, 1.0)
+        sharp = _sharpness(resolution(placement), _floor(scene, *here))
+        sharp *= _bilinear(scene.member[index].astype(np.float32), *here)
         if not (central * sharp).any():
             continue
         shrink = _shrink(xy, step)
@@ -324,16 +318,19 @@ def _lattice_box(lattice: Lattice, x0: int, y0: int, width: int, height: int) ->
     return span(lattice.y_px, y0, height), span(lattice.x_px, x0, width)
 
 
-def _interpolate(
-    scene: _Scene, shape: tuple[int, int], x0: int, y0: int, step: int = GRID_PX
+def _lattice_at(
+    lattice: Lattice, shape: tuple[int, int], x0: int, y0: int, step: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Resolution floor and crowd level at the points of a tile's grid, bilinear; points that nobody sees do not pull
-    the floor down."""
-    rows = (y0 + step * np.arange(shape[0])) / max(scene.lattice.y_px[1], 1e-9)
-    columns = (x0 + step * np.arange(shape[1])) / max(scene.lattice.x_px[1], 1e-9)
+    """Lattice rows (m,) and columns (k,), with fractions, of a tile's grid of `step` px."""
+    rows = (y0 + step * np.arange(shape[0])) / max(lattice.y_px[1], 1e-9)
+    columns = (x0 + step * np.arange(shape[1])) / max(lattice.x_px[1], 1e-9)
+    return rows, columns
+
+
+def _floor(scene: _Scene, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Resolution floor at lattice positions; points that nobody sees do not pull it down."""
     share = _bilinear((scene.floor > 0).astype(np.float64), rows, columns)
-    floor = np.where(share > 0, _bilinear(scene.floor, rows, columns) / np.maximum(share, 1e-9), 0.0)
-    return floor, _bilinear(scene.crowd.astype(np.float64), rows, columns)
+    return np.where(share > 0, _bilinear(scene.floor, rows, columns) / np.maximum(share, 1e-9), 0.0)
 
 
 def _bilinear(

@@ -32,7 +32,6 @@ class CompositeOptions:
     """
 
     views: int = 17
-    crowd: float = 1.2
     tile_px: int = 512
     finer: float = 1.3
     min_span: int = 50
@@ -239,23 +238,74 @@ def select_views(
     return chosen, count, limit
 
 
-def crowd_level(
-    views: Sequence[Placement], lattice: Lattice, floor: NDArray[np.float64], options: CompositeOptions
-) -> NDArray[np.float32]:
-    """Per lattice point, the centrality that crowd x K of the views reach; 0 where fewer look at it.
+def share_views(
+    placements: Sequence[Placement],
+    rating: Rating,
+    lattice: Lattice,
+    scale_px: float,
+    options: CompositeOptions,
+) -> NDArray[np.bool_]:
+    """Which views count at which lattice point: (n, ny, nx). Between points their weights are interpolated.
 
-    One set of frames for the whole panorama gives some points twice the views that they need. Fading out those
-    below this level saves their warping and leaves views that agree better; the level varies smoothly, so no step.
+    At most K views a point (and a third of K from rare close-ups before them), far apart in time: a strip seen for
+    a moment only makes the store hold many frames of that moment, and they must not outvote the other views where
+    those exist. A point that fewer than K see also takes the frames that nearly reach it, nearest first: a frame
+    that covers a part of a lattice cell may see none of its corners. scale_px: px per radian of the surface.
     """
-    n = max(1, round(options.crowd * options.views))
-    if len(views) <= n:
-        return np.zeros(len(lattice.rays), np.float32)
-    fine = np.array([resolution(p) for p in views])[:, None] >= 0.999 * floor
-    central = (
-        np.stack([centrality(p.ray_to_pixel(lattice.rays), p.size_px, options.margin_px) for p in views])
-        * fine
+    ny, nx = len(lattice.y_px), len(lattice.x_px)
+    time = np.array([p.frame for p in placements], dtype=np.float64)
+    cell = 1.5 * max(np.diff(lattice.x_px).max(), np.diff(lattice.y_px).max())
+    reach = np.stack(
+        [_inside_px(p.ray_to_pixel(lattice.rays), p.size_px) * scale_px / p.px_per_rad for p in placements]
     )
-    return np.partition(central, len(views) - n, axis=0)[len(views) - n].astype(np.float32)
+    fine = np.array([resolution(p) for p in placements])[:, None] >= 0.85 * rating.floor
+    near = np.where((rating.quality == 0) & fine & (reach < 0), np.maximum(1 + reach / cell, 0.0), 0.0)
+    shape = (len(placements), ny, nx)
+    quality, rare, near = rating.quality.reshape(shape), rating.rare.reshape(shape), near.reshape(shape)
+    taken = np.zeros(shape, bool)
+    before = np.zeros(shape[:2], bool)
+    for column in range(nx):
+        # What the neighbour took is preferred: fewer different frames in a tile.
+        liked = quality[:, :, column] * np.where(before, np.float32(1.5), np.float32(1))
+        here = _spread_in_time(
+            liked * rare[:, :, column], time, -(-options.views // 3), np.zeros(shape[:2], bool)
+        )
+        here = _spread_in_time(liked, time, options.views, here)
+        here = _spread_in_time(near[:, :, column], None, options.views, here)
+        taken[:, :, column] = before = here
+    return taken
+
+
+def _spread_in_time(
+    quality: NDArray[np.floating], time: NDArray[np.float64] | None, n_views: int, taken: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Fill every column of `taken` (n, p) up to n_views, each time by the largest quality x root of the time to the
+    nearest one taken (time None: by quality alone). Returns the fuller (n, p)."""
+    taken = taken.copy()
+    columns = np.arange(taken.shape[1])
+    apart = np.ones(taken.shape)
+    if time is not None:
+        gap = np.abs(time[:, None] - time)
+        apart *= max(float(np.ptp(time)), 1.0)
+        for row in np.flatnonzero(taken.any(axis=1)):
+            apart[:, taken[row]] = np.minimum(apart[:, taken[row]], gap[:, row, None])
+    for _ in range(n_views):
+        score = np.where(taken, 0.0, quality * np.sqrt(apart))
+        best = score.argmax(axis=0)
+        useful = (score[best, columns] > 0) & (taken.sum(axis=0) < n_views)
+        if not useful.any():
+            break
+        rows, where = best[useful], columns[useful]
+        taken[rows, where] = True
+        if time is not None:
+            apart[:, where] = np.minimum(apart[:, where], gap[:, rows])
+    return taken
+
+
+def _inside_px(xy: NDArray[np.float64], size_px: tuple[int, int]) -> NDArray[np.float64]:
+    """Distance (...,) of frame pixels to the frame's border, px, negative outside, -inf where not defined."""
+    half = (np.array(size_px, dtype=np.float64) - 1) / 2
+    return np.nan_to_num((half - np.abs(xy - half)).min(axis=-1), nan=-np.inf, neginf=-np.inf, posinf=-np.inf)
 
 
 def plan_views(
