@@ -29,6 +29,7 @@ def _ideal(seed: int) -> ClipSpec:
         f0_per_width=float(rng.uniform(1.1, 1.6)) if zoom < 2 else float(rng.uniform(0.95, 1.25)),
         there_and_back=bool(rng.uniform() < 0.4),
         roll_deg=float(rng.normal(0, 0.3)),
+        pan0_deg=float(rng.uniform(-6, 6)),
     )
     return ClipSpec(seed=seed, path=path, n_frames=200, player_share=float(rng.uniform(0.02, 0.25)))
 
@@ -117,7 +118,7 @@ def _panorama(seed: int) -> ClipSpec:
 
 def _sample(seed: int) -> ClipSpec:
     """The clip in assets/: 720p, mild lens, one pan with zoom in and out."""
-    path = PathSpec(pan_deg=24, zoom=1.7, tilt_deg=2.0, f0_per_width=1.3)
+    path = PathSpec(pan_deg=24, pan0_deg=-6, zoom=1.7, tilt_deg=2.0, f0_per_width=1.3)
     return ClipSpec(
         seed=seed,
         width=1280,
