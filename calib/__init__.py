@@ -5,6 +5,8 @@ judge() says whether the focal length may be published, RunningCalibrator does i
 """
 
 from calib.gates import GateOptions, judge
+from calib.level import LevelOptions, level
+from calib.observability import observability
 from calib.poses import PoseOptions, solve_poses
 from calib.records import (
     HomographyEdge,
@@ -27,6 +29,7 @@ __all__ = [
     "KnownFocal",
     "Lens",
     "Level",
+    "LevelOptions",
     "PoseOptions",
     "Priors",
     "RefineOptions",
@@ -35,6 +38,8 @@ __all__ = [
     "Solution",
     "Verdict",
     "judge",
+    "level",
+    "observability",
     "refine",
     "solve_poses",
 ]

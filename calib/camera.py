@@ -37,7 +37,7 @@ def infinite_homography(K_dst: ArrayLike, K_src: ArrayLike, R_dst_src: ArrayLike
 
 
 class Transfer(NamedTuple):
-    """Predicted raw points (..., m) x and y in b, and the Jacobian (..., 13, 2, m) or None; NaN where behind or folded."""
+    """Predicted raw points (..., m) x and y in b; Jacobian (..., 13, 2, m) or None; NaN where behind or folded."""
 
     x: Array
     y: Array
@@ -59,7 +59,7 @@ def transfer(
     """Raw points of a, (..., m), seen in b.
 
     log_f_a, log_f_b: (...,); R_b_a (..., 3, 3); shared (..., 5) = pp_x, pp_y, log aspect, c0, c1. The Jacobian's
-    columns: log f_a, left increment of R_a (3), log f_b, left increment of R_b (3), then (not pose_only) the shared five.
+    columns: log f_a, left increment of R_a (3), log f_b, left increment of R_b (3), and (not pose_only) the shared 5.
     """
     s2 = (width_px / 2) ** 2
     ppx, ppy, log_aspect, c0, c1 = (shared[..., k, None] for k in range(5))
@@ -104,7 +104,11 @@ def transfer(
         ga_inv = 1.0 / (1 + ka * ra)
         ux, uy = dx * shrink, dy * shrink
         ratio = 2 * ka / s2 / slope_a
-        i11, i12, i22 = ga_inv * (1 - ratio * ux * ux), -ga_inv * ratio * ux * uy, ga_inv * (1 - ratio * uy * uy)
+        i11, i12, i22 = (
+            ga_inv * (1 - ratio * ux * ux),
+            -ga_inv * ratio * ux * uy,
+            ga_inv * (1 - ratio * uy * uy),
+        )
     for row, (a, b, c) in enumerate(((G11, G12, G13), (G21, G22, G23))):
         x = a * R[..., 0, 0, :] + b * R[..., 1, 0, :] + c * R[..., 2, 0, :]
         y = a * R[..., 0, 1, :] + b * R[..., 1, 1, :] + c * R[..., 2, 1, :]

@@ -1,7 +1,7 @@
-"""Error bars at an optimum: covariance, cluster-robust sigma of the mean log f, perspective signal S10, edge statistics.
+"""Error bars at an optimum: covariance, cluster-robust sigma of the mean log f, signal S10, edge statistics.
 
-Source: calibration.md 6.6, 6.7, 7.3, 7.4. The formal covariance takes cells for independent; cells of one edge share the
-errors of its registration, so the sandwich over edges is what gets published, and all variances are scaled by it.
+Source: calibration.md 6.6, 6.7, 7.3, 7.4. The formal covariance takes cells for independent; cells of one edge share
+the errors of its registration, so the sandwich over edges is what gets published, and all variances are scaled by it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KAPPA_PRIOR, KAPPA_PRIOR_EDGES = 4.0, 4.0
 
 
 def homography_directions(packed: Packed, state: State) -> Array:
-    """Orthonormal bases (E, 2 m, 8) of the whitened residual directions that a change of the edge's homography can make."""
+    """Orthonormal bases (E, 2 m, 8) of the whitened residual directions that a change of an edge's homography makes."""
     a, _, root = packed.points()
     E, m = packed.dof.shape
     H = np.where(np.isfinite(packed.H), packed.H, np.eye(3))
@@ -149,13 +149,21 @@ def summarise(
         frames=frames, log_f=log_f, R=R, lens=lens, reference=int(frames[row]), sigma_log_f=sigma_log_f,
         sigma_log_zoom=sigma_zoom, cov_rot=cov_rot, sigma_mean_log_f=sigma_mean, sigma_mean_formal=formal,
         lens_std=lens_std, chi2_dof=chi2_dof, s10_px=s10, edge_chi2=chi2, edge_kappa=kappa, edge_ok=ok,
-        rms_px=rms, converged=converged, stop=result.stop[0] if converged or result.stop[0] != "converged" else "singular",
+        rms_px=rms, converged=converged,
+        stop=result.stop[0] if converged or result.stop[0] != "converged" else "singular",
         n_steps=int(result.n_steps[0]), cost=float(result.cost[0]), starts=starts, linear_valid=share, priors=priors,
     )  # fmt: skip
 
 
 def _cluster_sigma(
-    covariance: Array, u: Array, layout: Layout, terms: PriorTerms, result: Result, kappa: Array, chi2_dof: float, n_free: int
+    covariance: Array,
+    u: Array,
+    layout: Layout,
+    terms: PriorTerms,
+    result: Result,
+    kappa: Array,
+    chi2_dof: float,
+    n_free: int,
 ) -> float:
     """sigma of u^T x: sandwich over edges plus priors, never below the chi2-scaled formal value; few edges: kappa."""
     a = covariance @ u
@@ -163,7 +171,9 @@ def _cluster_sigma(
     per_edge = np.einsum("ej,ej->e", a[layout.columns], result.lin.gradient[0])
     spare = 8 * E - n_free
     # Prior information is not an edge's: its error enters with its own variance.
-    prior = float(np.sum(a[4 * layout.n :] ** 2 * np.where(layout.active[4 * layout.n :], terms.precision, 0.0)))
+    prior = float(
+        np.sum(a[4 * layout.n :] ** 2 * np.where(layout.active[4 * layout.n :], terms.precision, 0.0))
+    )
     prior += float((a[0 : 4 * layout.n : 4].mean()) ** 2 * terms.mean_precision)
     prior += float(np.sum(a[4 * terms.known_row] ** 2 * terms.known_precision))
     formal = float(u @ covariance @ u)

@@ -1,4 +1,4 @@
-"""Homographies from point matches: normalised, information-weighted DLT, batched; and maximum likelihood with covariance.
+"""Homographies from point matches: normalised, information-weighted DLT, batched; maximum likelihood, covariance.
 
 The DLT starts things; `fit` is the estimator to report: Gauss-Newton on the transfer error (noise in b, or in both:
 Sampson's first-order weights), Huber weights, covariance of h. Source: calibration.md 3; Hartley and Zisserman 4.
@@ -22,7 +22,9 @@ def square_root_information(info: ArrayLike) -> Array:
     root_det = np.sqrt(np.maximum(A[..., 0, 0] * A[..., 1, 1] - A[..., 0, 1] * A[..., 1, 0], 0.0))
     trace = A[..., 0, 0] + A[..., 1, 1] + 2 * root_det
     scale = np.sqrt(np.where(trace > 0, trace, 1.0))
-    return np.where(trace[..., None, None] > 0, (A + root_det[..., None, None] * np.eye(2)) / scale[..., None, None], 0.0)
+    return np.where(
+        trace[..., None, None] > 0, (A + root_det[..., None, None] * np.eye(2)) / scale[..., None, None], 0.0
+    )
 
 
 def _normalisation(points: Array, weight: Array) -> tuple[Array, Array]:

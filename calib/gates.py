@@ -29,7 +29,7 @@ SENTENCES = {
     "no_rotation": "The camera hardly turns, and only a turn reveals the focal length.",
     "zoom_only": "The camera zooms without turning; that gives the zoom ratio but not the focal length.",
     "roll_only": "The camera only rolls about its viewing direction, which does not reveal the focal length.",
-    "perspective_signal_below_systematics": "The perspective in this motion is smaller than the errors of the measurement.",
+    "perspective_signal_below_systematics": "The perspective of this motion is smaller than the measuring errors.",
     "model_misfit": "The measurements contradict a camera that only turns and zooms.",
     "distortion_not_modelled": "The lens distortion was held fixed without being known, which biases the focal length.",
     "pp_at_border": "The principal point ended at an impossible place, so the model does not describe this shot.",
@@ -45,8 +45,8 @@ class GateOptions:
     """Limits of a focal claim; px are at W = 1280 and scale with the width.
 
     max_sigma: largest relative error worth a claim. systematic_floor_px: smallest systematic error ever assumed.
-    coherent_gain: systematic px per px of smooth residual (rms over the median edge). max_chi2_dof: 2.4 to 3.4 is normal on real
-    clips that work, 7 where tracking failed. pp_x_sigmas of the prior; pp_y_px (parallax ends there: effective pp).
+    coherent_gain: systematic px per px of smooth residual (rms over edges). max_chi2_dof: 2.4 to 3.4 is normal on
+    real clips that work, 7 where tracking failed. pp_x_sigmas of the prior; pp_y_px (parallax ends there).
     f_range_w in widths. min_rows of 5 grid rows with texture; row_share of all cells makes a row count.
     min_rotation_w: motion of the centre, in widths, below which a shot "hardly turns".
     refits: measure halves and constant k (three warm refinements); False leaves these parts at 0.
@@ -117,7 +117,9 @@ def coherent_px(solution: Solution, graph: HomographyGraph) -> float:
     if not edges:
         return float("nan")
     packed = pack(graph, edges)
-    shared = np.array([[*solution.lens.pp_px, np.log(solution.lens.aspect), solution.lens.c0, solution.lens.c1]])
+    shared = np.array(
+        [[*solution.lens.pp_px, np.log(solution.lens.aspect), solution.lens.c0, solution.lens.c1]]
+    )
     state = State(solution.log_f[None], solution.R[None], shared)
     loss = Loss("huber", np.array([max(1.0, np.sqrt(solution.chi2_dof))]))
     with np.errstate(all="ignore"):
@@ -150,7 +152,9 @@ def halves_sigma(solution: Solution, graph: HomographyGraph, options: RefineOpti
         edges = tuple(graph.edges[k] for k in sorted(half.tolist()))
         frames = np.array(sorted({e.a for e in edges} | {e.b for e in edges}))
         sub = HomographyGraph(frames=frames, edges=edges, size_px=graph.size_px)
-        part = refine(sub, start=solution, priors=solution.priors, options=replace(options, reference=int(frames[0])))
+        part = refine(
+            sub, start=solution, priors=solution.priors, options=replace(options, reference=int(frames[0]))
+        )
         rows = np.array([solution.index(f) for f in frames.tolist()])
         both = np.isfinite(part.log_f) & np.isfinite(solution.log_f[rows])
         if not part.converged or not both.any() or not np.isfinite(part.sigma_mean_log_f):
@@ -160,7 +164,9 @@ def halves_sigma(solution: Solution, graph: HomographyGraph, options: RefineOpti
     return float(np.sqrt(max((d1 - d2) ** 2 - s1**2 - s2**2, 0.0)) / 2)
 
 
-def constant_k_sigma(solution: Solution, graph: HomographyGraph, options: RefineOptions) -> tuple[float, float]:
+def constant_k_sigma(
+    solution: Solution, graph: HomographyGraph, options: RefineOptions
+) -> tuple[float, float]:
     """Systematic part from constant k against k(f), and the plain difference of log f. (0, 0) where c1 is not free.
 
     A constant k that the data reject counts for little: weight 1 / (1 + z^2 / 4), z^2 its excess cost in units of
@@ -185,9 +191,14 @@ def sigma_parts(solution: Solution, graph: HomographyGraph, options: GateOptions
     """
     scale = graph.size_px[0] / 1280
     coherent = coherent_px(solution, graph)
-    s_px = max(options.systematic_floor_px * scale, options.coherent_gain * (coherent if np.isfinite(coherent) else np.inf))
+    s_px = max(
+        options.systematic_floor_px * scale,
+        options.coherent_gain * (coherent if np.isfinite(coherent) else np.inf),
+    )
     halves = halves_sigma(solution, graph, options.refine) if options.refits else 0.0
-    constant_k, difference = constant_k_sigma(solution, graph, options.refine) if options.refits else (0.0, 0.0)
+    constant_k, difference = (
+        constant_k_sigma(solution, graph, options.refine) if options.refits else (0.0, 0.0)
+    )
     return {
         "cluster": solution.sigma_mean_log_f,
         "signal": 0.1 * s_px / solution.s10_px if solution.s10_px > 0 else float("inf"),
@@ -275,13 +286,16 @@ def _ambiguous(solution: Solution, total: float) -> bool:
     kappa = max(float(np.nanmean(solution.edge_kappa[solution.edge_ok])), solution.chi2_dof, 1.0)
     best = min(solution.starts, key=lambda s: s.cost)
     return any(
-        abs(s.mean_log_f_over_w - best.mean_log_f_over_w) > max(total, 0.02) and (s.cost - best.cost) / kappa < 10
+        abs(s.mean_log_f_over_w - best.mean_log_f_over_w) > max(total, 0.02)
+        and (s.cost - best.cost) / kappa < 10
         for s in solution.starts
         if s.converged
     )
 
 
-def _flags(solution: Solution, graph: HomographyGraph, options: GateOptions, parts: dict[str, float]) -> tuple[str, ...]:
+def _flags(
+    solution: Solution, graph: HomographyGraph, options: GateOptions, parts: dict[str, float]
+) -> tuple[str, ...]:
     W, priors = graph.size_px[0], solution.priors
     flags = []
     if solution.chi2_dof > options.inflated_chi2_dof:
@@ -292,7 +306,10 @@ def _flags(solution: Solution, graph: HomographyGraph, options: GateOptions, par
         flags.append("unlinked_frames")
     if abs(solution.lens.pp_px[1] - priors.pp_mean_px(graph.size_px)[1]) > 2 * priors.pp_std_y * W:
         flags.append("effective_pp")
-    if abs(solution.lens.c0 - priors.c0_mean) > 3 * priors.c0_std or abs(solution.lens.c1 - priors.c1_mean) > 3 * priors.c1_std:
+    if (
+        abs(solution.lens.c0 - priors.c0_mean) > 3 * priors.c0_std
+        or abs(solution.lens.c1 - priors.c1_mean) > 3 * priors.c1_std
+    ):
         flags.append("distortion_extreme")
     if max(parts["halves"], parts["constant_k"]) > max(parts["cluster"], parts["signal"]):
         flags.append("subsets_disagree")

@@ -38,7 +38,10 @@ def invert(H: ArrayLike) -> Array:
 def from_anchors(anchors_src_px: ArrayLike, anchors_dst_px: ArrayLike) -> Array:
     """H_dst_src (..., 3, 3), det 1, that maps four points (..., 4, 2) exactly onto four points. NaN if degenerate."""
     src, dst = np.broadcast_arrays(np.asarray(anchors_src_px, float), np.asarray(anchors_dst_px, float))
-    centre, spread = src.mean((-2,), keepdims=True), np.abs(src - src.mean((-2,), keepdims=True)).max((-1, -2))
+    centre, spread = (
+        src.mean((-2,), keepdims=True),
+        np.abs(src - src.mean((-2,), keepdims=True)).max((-1, -2)),
+    )
     spread = spread[..., None, None]
     x, u = (src - centre) / spread, (dst - centre) / spread
     rows = np.zeros((*src.shape[:-2], 8, 8))

@@ -172,7 +172,7 @@ def root_focals(packed: Packed, tree: list[TreeEdge], root: int, H_centred: Arra
     Every edge's f_a is brought to the root by the chain's zoom ratios; weighted median, weights angle^4 (the
     information on f); twice, because the ratios depend weakly on f. NaN where no edge is valid.
     """
-    S, E = H_centred.shape[:2]
+    S = len(H_centred)
     usable = packed.dof.sum(1) >= 8
     f_a = square_pixel_focal(H_centred)
     valid = np.isfinite(f_a) & usable

@@ -24,7 +24,7 @@ MAX_BAND = 12  # frames: links between free frames that reach further get their 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseOptions:
-    """How solve_poses() works. huber in sigmas times the robust scale; bad_edge as in RefineOptions; tolerance relative."""
+    """How solve_poses() works: huber in sigmas times the robust scale; bad_edge as in RefineOptions."""
 
     huber: float = 3.0
     bad_edge: float = 6.0
@@ -54,7 +54,9 @@ class _PoseSystem:
             for i in range(4):
                 right[:, i] += np.bincount(where[use], gradient[use, part.start + i], n)
                 for j in range(4):
-                    diagonal[:, i, j] += np.bincount(where[use], blocks[use, part.start + i, part.start + j], n)
+                    diagonal[:, i, j] += np.bincount(
+                        where[use], blocks[use, part.start + i, part.start + j], n
+                    )
         return diagonal, right, blocks[self.both, 0:4, 4:8]
 
     def matrix(self, diagonal: Array, coupling: Array) -> sp.csc_array:
@@ -62,12 +64,12 @@ class _PoseSystem:
         n = len(self.free)
         four = np.arange(4)
 
-        def entries(rows: Array, cols: Array) -> tuple[Array, Array]:
+        def entries(rows: NDArray[np.int64], cols: NDArray[np.int64]) -> tuple[Array, Array]:
             r = np.broadcast_to(4 * rows[:, None, None] + four[:, None], (len(rows), 4, 4))
             c = np.broadcast_to(4 * cols[:, None, None] + four[None, :], (len(rows), 4, 4))
             return r.ravel(), c.ravel()
 
-        index = np.arange(n)
+        index = np.arange(n, dtype=np.int64)
         a, b = self.pa[self.both], self.pb[self.both]
         parts = [(*entries(index, index), diagonal), (*entries(a, b), coupling)]
         parts.append((*entries(b, a), np.swapaxes(coupling, 1, 2)))
@@ -86,7 +88,8 @@ def inverse_diagonal_blocks(A: sp.csc_array, band: int) -> Array:
     starts = list(range(0, 4 * n, size))
     stops = [min(s + size, 4 * n) for s in starts]
     A = A.tocsr()
-    T, X = [], []
+    T: list[Array] = []
+    X: list[Array] = []
     for k, (s, e) in enumerate(zip(starts, stops, strict=True)):
         block = A[s:e, s:e].toarray()
         if k:
@@ -96,10 +99,10 @@ def inverse_diagonal_blocks(A: sp.csc_array, band: int) -> Array:
             block = block - U.T @ gain
         T.append(block)
     out = np.zeros((n, 4, 4))
-    P = np.zeros((0, 0))
+    P: Array = np.zeros((0, 0))
     for k in range(len(starts) - 1, -1, -1):
         inverse = np.linalg.inv(T[k])
-        P = inverse if k == len(starts) - 1 else inverse + X[k] @ P @ X[k].T
+        P = np.asarray(inverse if k == len(starts) - 1 else inverse + X[k] @ P @ X[k].T)
         for j in range((stops[k] - starts[k]) // 4):
             out[starts[k] // 4 + j] = P[4 * j : 4 * j + 4, 4 * j : 4 * j + 4]
     return out
@@ -115,12 +118,14 @@ def _iterate(
         return state, cost, False, 0, None
     step_count = 0
     matrix, converged = None, False
-    for step_count in range(1, options.max_steps + 1):  # noqa: B007
+    for step_count in range(1, options.max_steps + 1):
         diagonal, right, coupling = system.assemble(lin.blocks[0], lin.gradient[0])
         matrix = system.matrix(diagonal, coupling)
         damped = (matrix + sp.diags_array(damping * matrix.diagonal() + 1e-12)).tocsc()
         try:
-            step = spla.splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right.ravel())
+            step = spla.splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
+                right.ravel()
+            )
         except RuntimeError:
             return state, cost, False, step_count, None
         step = step.reshape(-1, 4)
@@ -171,11 +176,10 @@ def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions 
     reach = linked_to(packed, np.ones(packed.n_edges, bool), is_held)
     free &= reach
     ok = reach[packed.ia] & reach[packed.ib]
-    e2 = whitened_squares(packed, state)
     n_steps, converged, cost, matrix = 0, True, 0.0, None
     system = _PoseSystem(packed.select(ok), free)
     loss = Loss("huber", np.ones(1), options.huber)
-    for look in range(2):
+    for _ in range(3):
         fit = ok & (free[packed.ia] | free[packed.ib])
         if not fit.any():
             break
@@ -185,13 +189,16 @@ def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions 
         system = _PoseSystem(chosen, free)
         state, cost, converged, steps, matrix = _iterate(chosen, system, state, loss, options)
         n_steps += steps
-        e2 = whitened_squares(packed, state)
-        now = ok & ~find_bad_edges(e2[0], packed, options.bad_edge)
+        # Judged anew each time: an edge that a wrong one had pulled away comes back.
+        now = ~find_bad_edges(whitened_squares(packed, state)[0], packed, options.bad_edge)
         reach = linked_to(packed, now, is_held)
-        if look == 1 or (now == ok).all():
+        now &= reach[packed.ia] & reach[packed.ib]
+        if (now == ok).all():
             break
-        ok, free = now & reach[packed.ia] & reach[packed.ib], ~is_held & reach
-    return _summarise(graph, held, packed, useful, state, is_held, free, ok, system, matrix, loss, cost, converged, n_steps)
+        ok, free = now, ~is_held & reach
+    return _summarise(
+        graph, held, packed, useful, state, is_held, free, ok, system, matrix, loss, cost, converged, n_steps
+    )
 
 
 def _initial(packed: Packed, graph: HomographyGraph, held: Solution, reference: int) -> State:
@@ -216,14 +223,21 @@ def _summarise(
     with np.errstate(all="ignore"):
         chi2_dof = float(np.nansum((chi2 * packed.dof.sum(1))[fit]) / dof) if fit.any() else float("nan")
     # An edge's errors are common to its cells: kappa, where the data show it; at least chi2.
-    inflate = max(1.0, chi2_dof if np.isfinite(chi2_dof) else 1.0, float(np.nanmean(kappa[fit])) if fit.any() else 1.0)
+    inflate = max(
+        1.0, chi2_dof if np.isfinite(chi2_dof) else 1.0, float(np.nanmean(kappa[fit])) if fit.any() else 1.0
+    )
     if matrix is not None and len(system.free):
         try:
             if system.band <= MAX_BAND:
                 blocks = inverse_diagonal_blocks(matrix, system.band)
             else:
                 lu = spla.splu(matrix.tocsc())
-                blocks = np.stack([lu.solve(np.eye(system.size, 4, -4 * k))[4 * k : 4 * k + 4] for k in range(system.size // 4)])
+                blocks = np.stack(
+                    [
+                        lu.solve(np.eye(system.size, 4, -4 * k))[4 * k : 4 * k + 4]
+                        for k in range(system.size // 4)
+                    ]
+                )
             own[system.free] = blocks * inflate
         except (np.linalg.LinAlgError, RuntimeError):
             converged = False

@@ -17,14 +17,17 @@ from calib.dlt import square_root_information
 from calib.records import HomographyEdge, HomographyGraph, Priors
 
 Array = NDArray[np.float64]
-CHUNK_POINTS = 60_000  # points linearised at once: keeps the working set of ~100 arrays inside a few tens of MB
+CHUNK_POINTS = (
+    60_000  # points linearised at once: keeps the working set of ~100 arrays inside a few tens of MB
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Packed:
-    """Edges as arrays, padded to the longest: ia, ib (E,) frame rows; a_x .. b_y (E, m) raw px; s11, s12, s22 (E, m)
+    """Edges as arrays, padded to the longest.
 
-    square root of the information; dof (E, m) directions known better than 1 px (0, 1 or 2); size_px.
+    ia, ib (E,) frame rows; a_x .. b_y (E, m) raw px; s11, s12, s22 (E, m) square root of the information; dof (E, m)
+    directions known better than 1 px (0, 1 or 2); H (E, 3, 3) as handed in.
     """
 
     ia: NDArray[np.int64]
@@ -60,7 +63,7 @@ class Packed:
         )  # fmt: skip
 
     def thin(self, n_points: int) -> Packed:
-        """The same edges with about n_points of their points, well spread: a stride through each edge's known points."""
+        """The same edges with about n_points of their points: an even stride through each edge's known points."""
         m = self.dof.shape[1]
         if m <= n_points:
             return self
@@ -69,7 +72,9 @@ class Packed:
         count = np.maximum((self.dof > 0).sum(1), 1)
         # Golden-ratio phase per edge: not the same columns of the grid in every edge.
         phase = (np.arange(self.n_edges) * 0.618) % 1.0
-        steps = (np.arange(n_points)[None, :] + phase[:, None]) * np.maximum(count, n_points)[:, None] / n_points
+        steps = (
+            (np.arange(n_points)[None, :] + phase[:, None]) * np.maximum(count, n_points)[:, None] / n_points
+        )
         pick = np.take_along_axis(order, np.minimum(steps.astype(int), m - 1), 1)
 
         def take(values: Array) -> Array:
@@ -99,7 +104,9 @@ def pack(graph: HomographyGraph, edges: Sequence[HomographyEdge] | None = None) 
     for k, edge in enumerate(edges):
         n = len(edge.grid_a)
         grid_a[k, :n], grid_b[k, :n], info[k, :n] = edge.grid_a, edge.grid_b, edge.info / edge.kappa
-    finite = np.isfinite(grid_a).all(-1) & np.isfinite(grid_b).all(-1) & np.isfinite(info).all((-1, -2))
+    finite: NDArray[np.bool_] = np.asarray(
+        np.isfinite(grid_a).all(-1) & np.isfinite(grid_b).all(-1) & np.isfinite(info).all((-1, -2))
+    )
     info = np.where(finite[..., None, None], info, 0.0)
     # A point without information must not decide whether a camera is possible: it goes to the centre.
     known = info.sum((-1, -2)) != 0
@@ -140,9 +147,9 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linearised:
-    """cost (S,) robust; blocks (S, E, 13, 13), gradient (S, E, 13) of half the cost's negative slope (J^T W r);
+    """cost (S,) robust; blocks (S, E, 13, 13) J^T W J; gradient (S, E, 13) J^T W r; e2 (S, E, m) squares, whitened.
 
-    e2 (S, E, m) squared whitened residuals. An impossible state has cost inf.
+    An impossible state has cost inf.
     """
 
     cost: Array
@@ -182,7 +189,12 @@ def _chunks(n_edges: int, n_starts: int, m: int) -> list[slice]:
 
 
 def residuals(
-    packed: Packed, state: State, which: slice = slice(None), *, jacobian: bool = False, pose_only: bool = False
+    packed: Packed,
+    state: State,
+    which: slice = slice(None),
+    *,
+    jacobian: bool = False,
+    pose_only: bool = False,
 ) -> tuple[Array, Array, Array]:
     """Raw residuals r_x, r_y (S, E, m) px of measured minus predicted, and the Jacobian of the prediction or None."""
     ia, ib = packed.ia[which], packed.ib[which]
@@ -266,17 +278,31 @@ def robust_scale(e2: Array, dof: Array) -> Array:
 class PriorTerms:
     """Gaussian priors as additions to cost, normal matrix and gradient; `free` says which shared columns move."""
 
-    def __init__(self, priors: Priors, size_px: tuple[int, int], frames: NDArray[np.int64], free: Array) -> None:
+    def __init__(
+        self, priors: Priors, size_px: tuple[int, int], frames: NDArray[np.int64], free: NDArray[np.bool_]
+    ) -> None:
         W = size_px[0]
-        self.mean = np.array([*priors.pp_mean_px(size_px), np.log(priors.aspect), priors.c0_mean, priors.c1_mean])
+        self.mean = np.array(
+            [*priors.pp_mean_px(size_px), np.log(priors.aspect), priors.c0_mean, priors.c1_mean]
+        )
         self.std = np.array(
-            [priors.pp_std_x * W, priors.pp_std_y * W, max(priors.aspect_std, 1e-9), priors.c0_std, priors.c1_std]
+            [
+                priors.pp_std_x * W,
+                priors.pp_std_y * W,
+                max(priors.aspect_std, 1e-9),
+                priors.c0_std,
+                priors.c1_std,
+            ]
         )
         self.free = np.asarray(free, bool)
         self.precision = np.where(self.free, 1 / self.std**2, 0.0)
         self.mean_log_f, self.mean_precision = priors.log_f_mean + np.log(W), 1 / priors.log_f_std**2
         rows = {frame: k for k, frame in enumerate(frames.tolist())}
-        known = [(rows[p.frame], np.log(p.f_px), (p.f_px / p.std_px) ** 2) for p in priors.known_focals if p.frame in rows]
+        known = [
+            (rows[p.frame], np.log(p.f_px), (p.f_px / p.std_px) ** 2)
+            for p in priors.known_focals
+            if p.frame in rows
+        ]
         self.known_row = np.array([k for k, _, _ in known], int)
         self.known_log_f = np.array([v for _, v, _ in known], float)
         self.known_precision = np.array([w for _, _, w in known], float)
@@ -285,7 +311,9 @@ class PriorTerms:
         """Sum of squared prior residuals (S,)."""
         out = np.sum(self.precision * (state.shared - self.mean) ** 2, -1)
         out = out + self.mean_precision * (state.log_f.mean(-1) - self.mean_log_f) ** 2
-        return out + np.sum(self.known_precision * (state.log_f[:, self.known_row] - self.known_log_f) ** 2, -1)
+        return out + np.sum(
+            self.known_precision * (state.log_f[:, self.known_row] - self.known_log_f) ** 2, -1
+        )
 
     def shared_gradient(self, state: State) -> Array:
         """J^T W r of the shared parameters (S, 5)."""

@@ -1,4 +1,4 @@
-"""Records that calib takes and gives. Points are raw (distorted) pixels unless a name says otherwise; angles in radians.
+"""Records that calib takes and gives. Points are raw (distorted) pixels unless a name says otherwise; radians.
 
 H_b_a maps pixels of a into b, R_cam_world world axes into camera axes, f is fx in pixels of the decoded width W and is
 carried as log f: sigma(log f) is the relative error. Arrays inside a record are read-only copies.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +21,10 @@ BoolArray = NDArray[np.bool_]
 
 
 def _freeze(record: object, name: str, shape: tuple[int | None, ...], dtype: type = float) -> None:
-    value = np.array(getattr(record, name), dtype=dtype, copy=True)
-    if value.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, value.shape, strict=True)):
+    value: NDArray[Any] = np.array(getattr(record, name), dtype=dtype, copy=True)
+    if value.ndim != len(shape) or any(
+        s is not None and s != n for s, n in zip(shape, value.shape, strict=True)
+    ):
         raise ValueError(f"{type(record).__name__}.{name} must have shape {shape}, got {value.shape}")
     value.setflags(write=False)
     object.__setattr__(record, name, value)
@@ -137,7 +140,7 @@ class Priors:
     """Gaussian knowledge before any picture. Lengths are fractions of the width W, so that they scale with the picture.
 
     pp_std_x, pp_std_y: 10 and 25 px at W = 1280 about pp (None: the centre). Vertically the principal point soaks up
-    the parallax of a pupil in front of the pan axis: it is an effective one. Measured on a soccer and a basketball clip.
+    the parallax of a pupil in front of the pan axis: an effective one (measured on a soccer and a basketball clip).
     c0_std, c1_std: of k1_half(f) = c0 + c1 log(f / W). log_f_mean, log_f_std: of mean log(f / W); weak, it only keeps
     unobservable shots finite. aspect: fx / fy, fixed while aspect_std is 0. known_focals: from the user.
     """
@@ -177,8 +180,9 @@ class StartResult:
 class Solution:
     """A calibrated set of frames. NaN rows: frames that no accepted edge links to the reference.
 
-    frames (n,); log_f (n,) of px; R (n, 3, 3) = R_cam_world, I at `reference`; lens. sigma_log_f (n,): absolute, statistical (cluster-
-    robust); sigma_log_zoom (n,): of log f - log f(reference); cov_rot (n, 3, 3) rad^2 of the left increment.
+    frames (n,); log_f (n,) of px; R (n, 3, 3) = R_cam_world, I at `reference`; lens. sigma_log_f (n,): absolute,
+    statistical (cluster-robust); sigma_log_zoom (n,): of log f - log f(reference); cov_rot (n, 3, 3) rad^2 of the
+    left increment.
     sigma_mean_log_f and its formal value without the edges' common errors; lens_std: pp_x, pp_y px, log_aspect, c0, c1.
     chi2_dof: robust, against the stated information. s10_px: px that 10 % of focal move the best edge.
     Per edge: edge_chi2 (mean square whitened residual per degree of freedom), edge_kappa, edge_ok.
@@ -235,7 +239,7 @@ class Solution:
         return int(found[0])
 
     def with_reference(self, frame: int) -> Solution:
-        """The same cameras with world axes = axes of `frame`. Rotation covariances are kept as they are (approximate)."""
+        """The same cameras with world axes = axes of `frame`; rotation covariances stay as they are (approximate)."""
         return replace(self, R=self.R @ self.R[self.index(frame)].T, reference=frame)
 
     def H_reference_frame(self) -> Array:

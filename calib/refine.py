@@ -6,7 +6,8 @@ and returns error bars that count an edge, not a cell, as the independent unit. 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +26,12 @@ from calib.problem import (
     robust_scale,
     whitened_squares,
 )
-from calib.records import HomographyGraph, Priors, Solution, StartResult
-from calib.solver import Layout, Result, minimise
+from calib.records import HomographyGraph, Lens, Priors, Solution, StartResult
+from calib.solver import Layout, NormalEquations, Result, minimise
 
 Array = NDArray[np.float64]
+# The loss scale is the fixed point of fit and median residual, so that it does not depend on where a fit began.
+MAX_LOOKS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,9 +40,11 @@ class RefineOptions:
 
     reference: frame with R = I (None: the first of the graph). distortion: False fixes k1 at the priors' mean (for
     comparison only: without it f is 40 % short on real pictures). free_pp: False holds the principal point at its
-    prior. zoom_for_c1: log zoom range below which c1 stays at its prior mean. robust: 'huber' or 'tukey' (Tukey after Huber has
-    converged). huber: threshold in sigmas times the robust scale. bad_edge: an edge whose median residual exceeds this many times the
-    graph's is dropped. tolerance, max_steps: the keyframe graph's valley is flat, an early stop looks like many optima.
+    prior. zoom_for_c1: log zoom range below which c1 stays at its prior mean. robust: 'huber' or 'tukey' (Tukey after
+    Huber has converged). huber: threshold in sigmas times the robust scale. bad_edge: an edge whose median residual
+    exceeds this many times the graph's is dropped. tolerance, max_steps: the keyframe graph's valley is flat, an early
+    stop looks like many optima. hopeless_sigma: formal sigma of the leading start from which on only the three best
+    starts are followed (nothing is observable, and the valley has no end).
     k1_trials, focal_trials_w, focal_k1: the starts. thin: points an edge in the first, coarse look at a start.
     """
 
@@ -56,13 +61,20 @@ class RefineOptions:
     focal_trials_w: tuple[float, ...] = (0.6, 0.9, 1.35, 2.0, 3.0, 4.5)
     focal_k1: tuple[float, ...] = (-0.03, 0.0, 0.03)
     thin: int = 10
+    hopeless_sigma: float = 0.15
 
 
 def free_columns(priors: Priors, options: RefineOptions, zoom_range: float) -> NDArray[np.bool_]:
     """Which of pp_x, pp_y, log aspect, c0, c1 move."""
     k1 = options.distortion
     return np.array(
-        [options.free_pp, options.free_pp, priors.aspect_std > 0, k1, k1 and zoom_range >= options.zoom_for_c1]
+        [
+            options.free_pp,
+            options.free_pp,
+            priors.aspect_std > 0,
+            k1,
+            k1 and zoom_range >= options.zoom_for_c1,
+        ]
     )
 
 
@@ -95,7 +107,9 @@ def find_bad_edges(e2: Array, packed: Packed, limit: float) -> NDArray[np.bool_]
     return median > limit * typical
 
 
-def multistart_states(packed: Packed, tree: list[linear.TreeEdge], root: int, priors: Priors, options: RefineOptions):
+def multistart_states(
+    packed: Packed, tree: list[linear.TreeEdge], root: int, priors: Priors, options: RefineOptions
+) -> tuple[list[str], State, float]:
     """Names, states and the valid share of the linear equations of all starts."""
     pp, W = priors.pp_mean_px(packed.size_px), packed.size_px[0]
     trials = np.array(options.k1_trials if options.distortion else (0.0,))
@@ -131,6 +145,17 @@ def multistart_states(packed: Packed, tree: list[linear.TreeEdge], root: int, pr
     return names, joined, float(share[good].max()) if len(good) else 0.0
 
 
+def formal_sigma(layout: Layout, terms: PriorTerms, result: Result) -> float:
+    """Formal standard deviation of mean log f at a result's first start; inf when singular."""
+    u = np.zeros(layout.size)
+    u[0 : 4 * layout.n : 4] = 1 / layout.n
+    equations = NormalEquations(layout, terms, result.state, result.lin)
+    try:
+        return float(np.sqrt(max(float(u @ equations.solve_for(u)), 0.0)))
+    except np.linalg.LinAlgError:
+        return float("inf")
+
+
 def _distinct(cost: Array, mean_log_f: Array, c0: Array) -> NDArray[np.int64]:
     """Starts to follow to the end: every finite one that is not already at the same point as a better one."""
     kept: list[int] = []
@@ -150,7 +175,7 @@ def _distinct(cost: Array, mean_log_f: Array, c0: Array) -> NDArray[np.int64]:
 def _from_scratch(
     packed: Packed, reference: int, frames: NDArray[np.int64], prior_args: tuple, options: RefineOptions
 ) -> tuple[State, NDArray[np.bool_], NDArray[np.bool_], tuple[StartResult, ...], float, Array] | None:
-    """Best state (S = 1), accepted edges, free columns, starts, valid share, loss scale; None when nothing is possible."""
+    """Best state (S = 1), accepted edges, free columns, starts, valid share, loss scale; None: nothing is possible."""
     priors, size_px = prior_args
     tree = linear.spanning_tree(packed, reference, frames)
     names, states, share = multistart_states(packed, tree, reference, priors, options)
@@ -162,17 +187,29 @@ def _from_scratch(
 
     # 1. A coarse look: few points an edge, the scale that each start has itself.
     scale = robust_scale(whitened_squares(coarse, states), coarse.dof)
-    result = minimise(coarse, layout, terms, states, Loss("huber", scale, options.huber), max_steps=8, tolerance=1e-3)
+    result = minimise(
+        coarse, layout, terms, states, Loss("huber", scale, options.huber), max_steps=8, tolerance=1e-3
+    )
     e2 = whitened_squares(coarse, result.state)
     scale = robust_scale(e2, coarse.dof)
-    result = minimise(coarse, layout, terms, result.state, Loss("huber", scale, options.huber), max_steps=40, tolerance=1e-5)
+    result = minimise(
+        coarse,
+        layout,
+        terms,
+        result.state,
+        Loss("huber", scale, options.huber),
+        max_steps=100,
+        tolerance=1e-8,
+    )
     # One scale for all, that of the best: only then are their costs comparable.
     scale = robust_scale(result.lin.e2, coarse.dof)
     alive = np.flatnonzero(np.isfinite(result.cost))
     if not len(alive):
         return None
     leader = alive[np.argmin(scale[alive])]
-    ok = ~find_bad_edges(whitened_squares(packed, result.state.pick(np.array([leader])))[0], packed, options.bad_edge)
+    ok = ~find_bad_edges(
+        whitened_squares(packed, result.state.pick(np.array([leader])))[0], packed, options.bad_edge
+    )
     ok = ok if ok.any() else np.ones_like(ok)
     common = Loss("huber", np.full(len(alive), scale[leader]), options.huber)
     here = result.state.pick(alive)
@@ -180,9 +217,27 @@ def _from_scratch(
     layout = Layout(fine, reference, free)
     cost = linearise(fine, here, common).cost + terms.cost(here)
     kept = _distinct(cost, here.log_f.mean(1), here.shared[:, 3])
+    if len(kept) > 3:
+        leading = minimise(
+            fine,
+            layout,
+            terms,
+            here.pick(kept[:1]),
+            common.pick(kept[:1]),
+            max_steps=30,
+            tolerance=options.tolerance,
+        )
+        if formal_sigma(layout, terms, leading) > options.hopeless_sigma:
+            kept = kept[:3]
     # 2. Every distinct survivor on all points, to the end, before any two are compared.
     final = minimise(
-        fine, layout, terms, here.pick(kept), common.pick(kept), max_steps=options.max_steps, tolerance=options.tolerance
+        fine,
+        layout,
+        terms,
+        here.pick(kept),
+        common.pick(kept),
+        max_steps=options.max_steps,
+        tolerance=options.tolerance,
     )
     best = int(np.argmin(final.cost))
     W = size_px[0]
@@ -197,14 +252,21 @@ def _from_scratch(
 
 
 def _warm(
-    packed: Packed, reference: int, frames: NDArray[np.int64], start: Solution, prior_args: tuple, options: RefineOptions
+    packed: Packed,
+    reference: int,
+    frames: NDArray[np.int64],
+    start: Solution,
+    prior_args: tuple,
+    options: RefineOptions,
 ) -> tuple[State, NDArray[np.bool_], Array]:
     """State (S = 1) from a solution, frames missing in it chained on; free columns; loss scale."""
     priors, _ = prior_args
     state = state_from_solution(packed, frames, start, reference)
     free = free_columns(priors, options, float(np.ptp(state.log_f)))
     if not free[4]:
-        state.shared[:, 3] += (state.shared[:, 4] - priors.c1_mean) * float(state.log_f.mean() - packed.log_width)
+        state.shared[:, 3] += (state.shared[:, 4] - priors.c1_mean) * float(
+            state.log_f.mean() - packed.log_width
+        )
         state.shared[:, 4] = priors.c1_mean
     if not options.distortion:
         state.shared[:, 3] = priors.c0_mean
@@ -270,7 +332,9 @@ def refine(
     inside = in_reach[everything.ia] & in_reach[everything.ib] & (everything.dof.sum(1) >= 8)
     if not in_reach.all():
         part = HomographyGraph(
-            frames=frames[in_reach], edges=tuple(e for e, k in zip(graph.edges, inside, strict=True) if k), size_px=graph.size_px
+            frames=frames[in_reach],
+            edges=tuple(e for e, k in zip(graph.edges, inside, strict=True) if k),
+            size_px=graph.size_px,
         )
         return _spread(refine(part, start=start, priors=priors, options=options), graph, inside)
     packed = everything.select(inside)
@@ -298,7 +362,7 @@ def polish(
 ) -> tuple[Result, NDArray[np.bool_], Loss]:  # fmt: skip
     """Re-estimate scale and bad edges around one state until both stay, then iterate to the end."""
     n_steps = 0
-    for look in range(3):
+    for look in range(MAX_LOOKS):
         loss = Loss("huber", scale, options.huber)
         rough = minimise(
             packed.select(ok), Layout(packed.select(ok), row, free), terms, state, loss,
@@ -311,15 +375,17 @@ def polish(
         now &= linked_pairs(packed, now, row)
         now = now if now.any() else ok
         new_scale = robust_scale(e2[:, now], packed.dof[now])
-        settled = bool((now == ok).all()) and abs(float(new_scale[0] / scale[0]) - 1) < 0.03
+        settled = bool((now == ok).all()) and abs(float(new_scale[0] / scale[0]) - 1) < 1e-4
         ok = now
-        if settled or look == 2:
+        if settled or look == MAX_LOOKS - 1:
             break
         scale = new_scale
     loss = Loss(options.robust, scale, options.huber)
     chosen = packed.select(ok)
     layout = Layout(chosen, row, free)
-    result = minimise(chosen, layout, terms, state, loss, max_steps=options.max_steps, tolerance=options.tolerance)
+    result = minimise(
+        chosen, layout, terms, state, loss, max_steps=options.max_steps, tolerance=options.tolerance
+    )
     result.n_steps[0] += n_steps
     return result, ok, loss
 
@@ -332,11 +398,11 @@ def linked_pairs(packed: Packed, ok: NDArray[np.bool_], row: int) -> NDArray[np.
 
 def nothing(graph: HomographyGraph, priors: Priors, reference: int, stop: str) -> Solution:
     """The Solution that says nothing: NaN cameras and the reason in `stop`."""
-    from calib.records import Lens
-
     n, E = len(graph.frames), len(graph.edges)
     nan = np.full(n, np.nan)
-    lens = Lens(size_px=graph.size_px, pp_px=priors.pp_mean_px(graph.size_px), aspect=priors.aspect, c0=priors.c0_mean)
+    lens = Lens(
+        size_px=graph.size_px, pp_px=priors.pp_mean_px(graph.size_px), aspect=priors.aspect, c0=priors.c0_mean
+    )
     return Solution(
         frames=graph.frames, log_f=nan, R=np.full((n, 3, 3), np.nan), lens=lens, reference=reference,
         sigma_log_f=nan, sigma_log_zoom=nan, cov_rot=np.full((n, 3, 3), np.nan), sigma_mean_log_f=np.nan,
@@ -348,8 +414,6 @@ def nothing(graph: HomographyGraph, priors: Priors, reference: int, stop: str) -
 
 def _spread(part: Solution, graph: HomographyGraph, inside: NDArray[np.bool_]) -> Solution:
     """A solution of some frames and edges, in the rows of the whole graph."""
-    from dataclasses import replace
-
     rows = {frame: k for k, frame in enumerate(part.frames.tolist())}
     n = len(graph.frames)
     index = np.array([rows.get(frame, -1) for frame in graph.frames.tolist()])
@@ -359,7 +423,7 @@ def _spread(part: Solution, graph: HomographyGraph, inside: NDArray[np.bool_]) -
         out[index >= 0] = values[index[index >= 0]]
         return out
 
-    def per_edge(values: Array, empty: float) -> Array:
+    def per_edge(values: NDArray[Any], empty: float) -> NDArray[Any]:
         out = np.full(len(graph.edges), empty, dtype=values.dtype)
         out[inside] = values
         return out

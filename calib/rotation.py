@@ -39,7 +39,9 @@ def exp(vectors: ArrayLike) -> Array:
 def log(rotations: ArrayLike) -> Array:
     """Rotation vectors (..., 3) rad of rotation matrices (..., 3, 3); angle in [0, pi], exact also near pi."""
     R = np.asarray(rotations, float)
-    vee = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    vee = 0.5 * np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
     sine = np.linalg.norm(vee, axis=-1)
     cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1)
     angle = np.arctan2(sine, cosine)
@@ -83,7 +85,7 @@ def to_pan_tilt_roll(rotations: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def project_so3(matrices: ArrayLike) -> Array:
-    """Nearest rotations (..., 3, 3) in the Frobenius norm: U diag(1, 1, det U V^T) V^T. NaN where the input is not finite."""
+    """Nearest rotations (..., 3, 3), Frobenius norm: U diag(1, 1, det U V^T) V^T. NaN where the input is not finite."""
     M = np.asarray(matrices, float)
     finite = np.isfinite(M).all((-1, -2))
     U, _, Vt = np.linalg.svd(np.where(finite[..., None, None], M, np.eye(3)))

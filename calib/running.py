@@ -59,7 +59,7 @@ class CameraEstimate:
     """One frame: log_f of px, R (3, 3) = R_cam_world (world = axes of the first keyframe), relative errors, lens.
 
     sigma_log_f: total error of log f (inf before anything is known); sigma_log_zoom: relative to the first keyframe.
-    ready: the focal may be used. status: 'ok', 'relative' (not ready), 'lost', 'predicted'; reason: a code of SENTENCES.
+    ready: the focal may be used. status: 'ok', 'relative' (not ready), 'lost', 'predicted'; reason: code of SENTENCES.
     """
 
     frame: int
@@ -116,7 +116,13 @@ class RunningCalibrator:
         if self._solution is not None:
             return self._solution.lens
         pp = self.priors.pp_mean_px(self.size_px)
-        return Lens(size_px=self.size_px, pp_px=pp, aspect=self.priors.aspect, c0=self.priors.c0_mean, c1=self.priors.c1_mean)
+        return Lens(
+            size_px=self.size_px,
+            pp_px=pp,
+            aspect=self.priors.aspect,
+            c0=self.priors.c0_mean,
+            c1=self.priors.c1_mean,
+        )
 
     @property
     def sigma_log_f(self) -> float:
@@ -145,7 +151,9 @@ class RunningCalibrator:
         """
         for edge in edges:
             if frame not in (edge.a, edge.b) or not ({edge.a, edge.b} - {frame}) <= set(self._keyframes):
-                raise ValueError(f"edge {edge.a} -> {edge.b} does not link keyframe {frame} to an earlier keyframe")
+                raise ValueError(
+                    f"edge {edge.a} -> {edge.b} does not link keyframe {frame} to an earlier keyframe"
+                )
         if frame in self._poses:
             raise ValueError(f"{frame} is a keyframe already")
         before = self.pose(frame)
@@ -168,10 +176,13 @@ class RunningCalibrator:
         self._adjust()
         pose = self._poses[frame]
         self._remember(frame, pose)
-        linked = bool(edges)
-        return self._estimate(frame, pose, "ok" if self.ready else "relative", "ok" if self.ready else "not_ready") if linked else (
-            self._estimate(frame, pose, "lost", "no_edges")
-        )  # fmt: skip
+        if not edges:
+            return self._estimate(frame, pose, "lost", "no_edges")
+        return self._estimate(frame, pose, *self._standing())
+
+    def _standing(self) -> tuple[str, str]:
+        """Status and reason of a frame that was measured."""
+        return ("ok", "ok") if self.ready else ("relative", "not_ready")
 
     def _window(self) -> list[int]:
         """Keyframes to adjust: the most recent ones, and older ones that edges tie to them most."""
@@ -222,10 +233,19 @@ class RunningCalibrator:
                 pose = self._poses[f]
                 turn = rotation.log(pose.R @ old_anchor.R.T) * math.exp(-shift)
                 self._poses[f] = _Pose(pose.log_f + shift, rotation.exp(turn) @ old_anchor.R)
-        self._solution = solution
-        self._score(solution, graph)
+        self._solution = self._regauge(solution)
+        self._score(self._solution, graph)
         keep = set(self._keyframes[-2 * self.options.window :]) | members
         self._edges = [e for e in self._edges if e.a in keep and e.b in keep]
+
+    def _regauge(self, solution: Solution) -> Solution:
+        """World axes = axes of the first keyframe, also after it has followed a change of focal from outside."""
+        turn = self._poses[self._keyframes[0]].R.T
+        for poses in (self._poses, self._recent):
+            for f, pose in poses.items():
+                poses[f] = _Pose(pose.log_f, rotation.orthonormalise(pose.R @ turn), pose.anchors)
+        self._poses[self._keyframes[0]].R = np.eye(3)
+        return replace(solution, R=solution.R @ turn)
 
     def _score(self, solution: Solution, graph: HomographyGraph) -> None:
         gates = self.options.gates
@@ -235,7 +255,11 @@ class RunningCalibrator:
             s_px = max(s_px, gates.coherent_gain * coherent)
         self._systematic = 0.1 * s_px / solution.s10_px if solution.s10_px > 0 else math.inf
         sigma = solution.sigma_mean_log_f
-        zoom = float(np.nanmax(solution.sigma_log_zoom)) if np.isfinite(solution.sigma_log_zoom).any() else math.inf
+        zoom = (
+            float(np.nanmax(solution.sigma_log_zoom))
+            if np.isfinite(solution.sigma_log_zoom).any()
+            else math.inf
+        )
         self._sigma = (sigma if np.isfinite(sigma) else math.inf, zoom)
 
     def _known(self, frames: Sequence[int]) -> Solution:
@@ -245,7 +269,8 @@ class RunningCalibrator:
         return Solution(
             frames=np.array(frames), log_f=np.array([p.log_f for p in poses]), R=np.array([p.R for p in poses]),
             lens=self.lens, reference=int(frames[0]), sigma_log_f=np.zeros(n), sigma_log_zoom=np.zeros(n),
-            cov_rot=np.zeros((n, 3, 3)), sigma_mean_log_f=np.nan, sigma_mean_formal=np.nan, lens_std={}, chi2_dof=np.nan,
+            cov_rot=np.zeros((n, 3, 3)), sigma_mean_log_f=np.nan, sigma_mean_formal=np.nan, lens_std={},
+            chi2_dof=np.nan,
             s10_px=0.0, edge_chi2=np.zeros(0), edge_kappa=np.zeros(0), edge_ok=np.zeros(0, bool), rms_px=np.zeros(n),
             converged=True, stop="held", n_steps=0, cost=np.nan, priors=self.priors,
         )  # fmt: skip
@@ -265,8 +290,7 @@ class RunningCalibrator:
         pose, own, alone = solved
         self._measure_velocity(frame, pose, alone)
         self._remember(frame, pose)
-        status = "ok" if self.ready else "relative"
-        return self._estimate(frame, pose, status, "ok" if self.ready else "not_ready", own)
+        return self._estimate(frame, pose, *self._standing(), own)
 
     def _usable(self, frame: int, edges: Sequence[HomographyEdge]) -> list[HomographyEdge]:
         """Edges between `frame` and a frame whose pose is known."""
@@ -336,7 +360,7 @@ class RunningCalibrator:
     def _direct_pose(
         self, frame: int, edges: Sequence[HomographyEdge], state: State, row: int, lin: Linearised
     ) -> _Pose | None:
-        """Pose by the edge to the previous frame alone: one Gauss-Newton step from the full one (they differ by < 1 px)."""
+        """Pose by the edge to the previous frame alone: one Gauss-Newton step from the full one (< 1 px apart)."""
         which = [k for k, e in enumerate(edges) if {e.a, e.b} == {self._last, frame}]
         if not which:
             return None
@@ -366,7 +390,7 @@ class RunningCalibrator:
         return _Pose(log_f, R) if np.isfinite(log_f) and np.isfinite(R).all() else None
 
     def _two_view(self, frame: int, edges: Sequence[HomographyEdge]) -> None:
-        """Before a second keyframe: calibrate (first keyframe, this frame), again whenever the motion grew by a quarter."""
+        """Before a second keyframe: calibrate (first keyframe, this frame), again when the motion grew by a quarter."""
         key = self._keyframes[0]
         mine = tuple(e for e in edges if {e.a, e.b} == {key, frame})
         if not mine:
@@ -425,7 +449,9 @@ class RunningCalibrator:
         nan = _Pose(math.nan, np.full((3, 3), math.nan))
         return self._estimate(frame, nan, "lost", reason)
 
-    def _estimate(self, frame: int, pose: _Pose, status: str, reason: str, own: float = 0.0) -> CameraEstimate:
+    def _estimate(
+        self, frame: int, pose: _Pose, status: str, reason: str, own: float = 0.0
+    ) -> CameraEstimate:
         return CameraEstimate(
             frame=frame, log_f=pose.log_f, R=pose.R, sigma_log_f=math.hypot(self.sigma_log_f, own),
             sigma_log_zoom=math.hypot(self._sigma[1], own), ready=self.ready and status == "ok", lens=self.lens,

@@ -30,7 +30,9 @@ def to_plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
-        flat = [number(x) for x in value.ravel().tolist()] if value.dtype.kind == "f" else value.ravel().tolist()
+        flat = (
+            [number(x) for x in value.ravel().tolist()] if value.dtype.kind == "f" else value.ravel().tolist()
+        )
         return {"shape": list(value.shape), "dtype": value.dtype.name, "values": flat}
     if isinstance(value, Mapping):
         return {str(k): to_plain(v) for k, v in value.items()}
@@ -65,7 +67,10 @@ def _build(hint: Any, value: Any) -> Any:
         return from_plain(hint, value)
     if origin is tuple:
         inner = arguments[0] if len(arguments) == 2 and arguments[1] is Ellipsis else None
-        return tuple(_build(inner if inner is not None else a, v) for v, a in zip(value, arguments if inner is None else value, strict=True))
+        return tuple(
+            _build(inner if inner is not None else a, v)
+            for v, a in zip(value, arguments if inner is None else value, strict=True)
+        )
     if isinstance(value, dict):
         return {k: _build(arguments[1] if len(arguments) == 2 else Any, v) for k, v in value.items()}
     if hint is float:

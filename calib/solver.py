@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over a batch of starts: assemble, damp, step, accept or reject, stop. No images, no priors' meaning.
+"""Levenberg-Marquardt over a batch of starts: assemble, damp, step, accept or reject, stop.
 
 Unknowns: 4 per frame (log f, left rotation increment) and the free ones of 5 shared. Below DENSE_BELOW pose unknowns
 the normal matrix is dense (one Cholesky per start); above, block-sparse frames with a bordered Schur complement.
@@ -27,7 +27,13 @@ MAX_ROTATION_STEP = 0.3
 class Layout:
     """Which unknown is where: 4 n pose entries, then 5 shared; `active` (4 n + 5,) False = held (gauge, fixed lens)."""
 
-    def __init__(self, packed: Packed, reference: int, free_shared: Array, held: NDArray[np.bool_] | None = None) -> None:
+    def __init__(
+        self,
+        packed: Packed,
+        reference: int,
+        free_shared: NDArray[np.bool_],
+        held: NDArray[np.bool_] | None = None,
+    ) -> None:
         n = packed.n_frames
         self.n, self.size = n, 4 * n + N_SHARED
         self.active = np.ones(self.size, bool)
@@ -68,7 +74,9 @@ class NormalEquations:
         self.gradient = layout.vector(lin.gradient)
         self.gradient[:, 4 * n :] += priors.shared_gradient(state)
         self.gradient[:, 0 : 4 * n : 4] += priors.mean_gradient(state)[:, None] / n
-        for row, value, weight in zip(priors.known_row, priors.known_log_f, priors.known_precision, strict=True):
+        for row, value, weight in zip(
+            priors.known_row, priors.known_log_f, priors.known_precision, strict=True
+        ):
             self.gradient[:, 4 * row] += weight * (value - state.log_f[:, row])
         self.gradient[:, ~layout.active] = 0.0
         self.extra = np.zeros(N)
@@ -113,14 +121,18 @@ class NormalEquations:
 
     def solve(self, start: int, damping: float) -> Array:
         """Damped step (4 n + 5,) of one start. Raises numpy.linalg.LinAlgError when the matrix is singular."""
+        return self.solve_for(self.gradient[start], start, damping)
+
+    def solve_for(self, right: Array, start: int = 0, damping: float = 0.0) -> Array:
+        """(damped matrix)^-1 right, both (4 n + 5,). Raises numpy.linalg.LinAlgError when the matrix is singular."""
         scale = 1 / np.sqrt(np.maximum(self.diagonal[start], 1e-300))
         if self.dense is not None:
             M = self.dense[start] * scale[:, None] * scale[None, :]
             M[np.diag_indices_from(M)] += damping
             factor = scipy.linalg.cho_factor(M, lower=True, overwrite_a=True, check_finite=False)
-            return scale * scipy.linalg.cho_solve(factor, scale * self.gradient[start], check_finite=False)
+            return scale * scipy.linalg.cho_solve(factor, scale * right, check_finite=False)
         step = np.zeros(self.layout.size)
-        solution = self._bordered(damping, self.gradient[0][np.concatenate([self.poses, self.lens])][:, None])
+        solution = self._bordered(damping, right[np.concatenate([self.poses, self.lens])][:, None])
         step[np.concatenate([self.poses, self.lens])] = solution[:, 0]
         return step
 
@@ -130,7 +142,9 @@ class NormalEquations:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
-                factor = spla.splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+                factor = spla.splu(
+                    A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+                )
         except (RuntimeError, Warning) as error:
             raise np.linalg.LinAlgError(str(error)) from error
         Y = factor.solve(np.hstack([self.B, right[:p]]))
@@ -163,7 +177,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """States of all starts after the iteration: cost (S,), converged (S,), n_steps (S,), stop reasons, last linearisation."""
+    """All starts after the iteration: cost (S,), converged (S,), n_steps (S,), stop reasons, last linearisation."""
 
     state: State
     cost: Array
@@ -203,7 +217,9 @@ def minimise(
     while running.any():
         live = np.flatnonzero(running)
         now = State(log_f[live], R[live], shared[live])
-        equations = NormalEquations(layout, priors, now, Linearised(cost[live], blocks[live], gradient[live], e2[live]))
+        equations = NormalEquations(
+            layout, priors, now, Linearised(cost[live], blocks[live], gradient[live], e2[live])
+        )
         pending = list(range(len(live)))
         step = np.zeros((len(live), layout.size))
         usable = np.zeros(len(live), bool)
@@ -232,7 +248,12 @@ def minimise(
             if new_cost[j] <= cost[k]:
                 change = (cost[k] - new_cost[j]) / max(cost[k], 1e-300)
                 log_f[k], R[k], shared[k] = trial.log_f[j], trial.R[j], trial.shared[j]
-                cost[k], blocks[k], gradient[k], e2[k] = new_cost[j], new.blocks[j], new.gradient[j], new.e2[j]
+                cost[k], blocks[k], gradient[k], e2[k] = (
+                    new_cost[j],
+                    new.blocks[j],
+                    new.gradient[j],
+                    new.e2[j],
+                )
                 if change < tolerance and not clamped[j] and damping[k] < 1e-2:
                     running[k], converged[k], stop[k] = False, True, "converged"
                 damping[k] = max(damping[k] * 0.1, 1e-12)
@@ -244,4 +265,6 @@ def minimise(
                     running[k], stop[k] = False, "singular" if not usable[j] else "diverged"
             if running[k] and steps[k] >= max_steps:
                 running[k] = False
-    return Result(State(log_f, R, shared), cost, converged, steps, stop, Linearised(cost, blocks, gradient, e2))
+    return Result(
+        State(log_f, R, shared), cost, converged, steps, stop, Linearised(cost, blocks, gradient, e2)
+    )

@@ -48,7 +48,9 @@ def path(
 def project(truth: Truth, a: int, b: int, points: Array) -> Array:
     """Raw points (m, 2) of row a seen in row b."""
     ideal = truth.lens.undistort(points, truth.log_f[a])
-    rays = np.concatenate([ideal, np.ones((len(ideal), 1))], 1) @ np.linalg.inv(truth.lens.K(truth.log_f[a])).T
+    rays = (
+        np.concatenate([ideal, np.ones((len(ideal), 1))], 1) @ np.linalg.inv(truth.lens.K(truth.log_f[a])).T
+    )
     w = rays @ (truth.R[b] @ truth.R[a].T).T @ truth.lens.K(truth.log_f[b]).T
     out = truth.lens.distort(w[:, :2] / w[:, 2:], truth.log_f[b])
     return np.where(w[:, 2:] > 0, out, np.nan)
