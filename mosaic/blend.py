@@ -38,30 +38,55 @@ def _dot4(flat, at, a0, a1, a2, a3):  # type: ignore[no-untyped-def]
     return _dot2(flat, at, a0, a1) + _dot2(flat, at + np.uintp(6), a2, a3)
 
 
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _cubic(flat, stride, xi, yi, s, t):  # type: ignore[no-untyped-def]
+    """The three channels between pixels (xi, yi) and (xi + 1, yi + 1), Catmull-Rom."""
+    a0, a1, a2, a3 = _catmull_rom(s)
+    b0, b1, b2, b3 = _catmull_rom(t)
+    at = np.uintp((yi - 1) * stride + 3 * (xi - 1))
+    one, two = np.uintp(1), np.uintp(2)
+    r = b0 * _dot4(flat, at, a0, a1, a2, a3)
+    g = b0 * _dot4(flat, at + one, a0, a1, a2, a3)
+    b = b0 * _dot4(flat, at + two, a0, a1, a2, a3)
+    for k in (b1, b2, b3):
+        at += np.uintp(stride)
+        r += k * _dot4(flat, at, a0, a1, a2, a3)
+        g += k * _dot4(flat, at + one, a0, a1, a2, a3)
+        b += k * _dot4(flat, at + two, a0, a1, a2, a3)
+    return r, g, b
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _linear(flat, stride, xi, yi, s, t):  # type: ignore[no-untyped-def]
+    """The three channels between pixels (xi, yi) and (xi + 1, yi + 1), bilinear."""
+    one = np.float32(1)
+    k00, k01, k10, k11 = (one - s) * (one - t), s * (one - t), (one - s) * t, s * t
+    at = np.uintp(yi * stride + 3 * xi)
+    under = at + np.uintp(stride)
+    r = _dot2(flat, at, k00, k01) + _dot2(flat, under, k10, k11)
+    g = _dot2(flat, at + np.uintp(1), k00, k01) + _dot2(flat, under + np.uintp(1), k10, k11)
+    b = _dot2(flat, at + np.uintp(2), k00, k01) + _dot2(flat, under + np.uintp(2), k10, k11)
+    return r, g, b
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def sample_view(
-    image, trust, has_trust, grid, step, gain, margin, feather, cubic, out, out_trust, out_weight
-):  # type: ignore[no-untyped-def]
+def sample_view(image, trust, has_trust, grid, step, gain, margin, feather, cubic, out, out_vote, out_weight):  # type: ignore[no-untyped-def]
     """Sample one frame over one tile.
 
-    image (H, W, 3) uint8; trust (H, W) uint8, read when has_trust. grid (rows, columns, 3) float32: frame x, frame y
-    and weight 0..1 at every `step`-th tile pixel, linear in between; a cell with a NaN corner is not seen. gain (3,)
-    multiplies the channels. A sample nearer than `margin` px to the frame's border is not seen; from there the
-    weight rises over `feather` px, so that no frame edge shows.
-    Out, all uint8: out (3, h, w); out_trust (h, w), 0 = not seen; out_weight (h, w), at least 1 where seen.
-    Catmull-Rom (cubic) or linear; float weights (cv2.remap rounds positions to 1/32 px).
+    image (H, W, 3) uint8; trust (H, W) uint8, read when has_trust. grid (rows, columns, 4) float32: frame x, frame y,
+    vote and weight 0..1 at every `step`-th tile pixel, linear in between. gain (3,) multiplies the channels. A sample
+    nearer than `margin` px to the frame's border, or of trust or vote 0, is not seen; from there vote and weight
+    rise over `feather` px, so that no frame edge shows. Both are multiplied by trust / 255.
+    Out, uint8: out (3, h, w); out_vote (h, w), 0 = not seen, else at least 1; out_weight (h, w), likewise.
+    Catmull-Rom (cubic) or linear, with float weights (cv2.remap rounds positions to 1/32 px).
     """
     height, width = image.shape[0], image.shape[1]
-    rows, columns = out_trust.shape
+    rows, columns = out_vote.shape
     flat, stride = image.reshape(-1), 3 * width
     x_last, y_last = width - 1 - margin, height - 1 - margin
     gain_r, gain_g, gain_b = gain[0], gain[1], gain[2]
-    one, per, rounding, full = (
-        np.float32(1),
-        np.float32(1) / np.float32(step),
-        np.float32(0.5),
-        np.float32(255),
-    )
+    zero, one, rounding, full = np.float32(0), np.float32(1), np.float32(0.5), np.float32(255)
+    per = one / np.float32(step)
     for row in range(rows):
         i = row // step
         v = np.float32(row - i * step) * per
@@ -72,51 +97,45 @@ def sample_view(
             x1 = grid[i, j + 1, 0] * (one - v) + grid[i + 1, j + 1, 0] * v
             y0 = grid[i, j, 1] * (one - v) + grid[i + 1, j, 1] * v
             y1 = grid[i, j + 1, 1] * (one - v) + grid[i + 1, j + 1, 1] * v
-            w0 = grid[i, j, 2] * (one - v) + grid[i + 1, j, 2] * v
-            w1 = grid[i, j + 1, 2] * (one - v) + grid[i + 1, j + 1, 2] * v
-            # -1e9 marks a corner that the frame does not see: any mix with it falls far outside.
-            dx, dy, dw = (x1 - x0) * per, (y1 - y0) * per, (w1 - w0) * per
+            c0 = full * (grid[i, j, 2] * (one - v) + grid[i + 1, j, 2] * v)
+            c1 = full * (grid[i, j + 1, 2] * (one - v) + grid[i + 1, j + 1, 2] * v)
+            w0 = full * (grid[i, j, 3] * (one - v) + grid[i + 1, j, 3] * v)
+            w1 = full * (grid[i, j + 1, 3] * (one - v) + grid[i + 1, j + 1, 3] * v)
+            # The map is linear along these pixels: when both ends are out on one side, all are. A corner that the
+            # frame does not see is at -1e9, and so far outside is any mix with it.
+            if (
+                max(x0, x1) < margin or min(x0, x1) > x_last or max(y0, y1) < margin or min(y0, y1) > y_last
+                or max(c0, c1) <= zero
+            ):  # fmt: skip
+                out_vote[row, left:right] = 0
+                out_weight[row, left:right] = 0
+                continue
+            dx, dy, dc, dw = (x1 - x0) * per, (y1 - y0) * per, (c1 - c0) * per, (w1 - w0) * per
             for column in range(left, right):
                 u = np.float32(column - left)
-                x = x0 + dx * u
-                y = y0 + dy * u
-                w = w0 + dw * u
-                if not (x >= margin and y >= margin and x <= x_last and y <= y_last and w > 0):
-                    out_trust[row, column] = 0
-                    out_weight[row, column] = 0
+                x, y, c = x0 + dx * u, y0 + dy * u, c0 + dc * u
+                out_vote[row, column] = 0
+                out_weight[row, column] = 0
+                edge = min(min(x - margin, x_last - x), min(y - margin, y_last - y))
+                if not (edge >= zero and c > zero):
                     continue
+                ramp = min((edge + one) / feather, one)
                 xi, yi = int(x), int(y)
-                sure = trust[int(y + rounding), int(x + rounding)] if has_trust else np.uint8(255)
-                if sure == 0:
-                    out_trust[row, column] = 0
-                    out_weight[row, column] = 0
-                    continue
+                if has_trust:
+                    sure = trust[int(y + rounding), int(x + rounding)]
+                    if sure == 0:
+                        continue
+                    ramp *= np.float32(sure) / full
                 s, t = x - np.float32(xi), y - np.float32(yi)
                 if cubic:
-                    a0, a1, a2, a3 = _catmull_rom(s)
-                    b0, b1, b2, b3 = _catmull_rom(t)
-                    r = g = b = np.float32(0)
-                    at = np.uintp((yi - 1) * stride + 3 * (xi - 1))
-                    for m in range(4):
-                        k = b0 if m == 0 else (b1 if m == 1 else (b2 if m == 2 else b3))
-                        r += k * _dot4(flat, at, a0, a1, a2, a3)
-                        g += k * _dot4(flat, at + np.uintp(1), a0, a1, a2, a3)
-                        b += k * _dot4(flat, at + np.uintp(2), a0, a1, a2, a3)
-                        at += np.uintp(stride)
+                    r, g, b = _cubic(flat, stride, xi, yi, s, t)
                 else:
-                    k00, k01, k10, k11 = (one - s) * (one - t), s * (one - t), (one - s) * t, s * t
-                    at = np.uintp(yi * stride + 3 * xi)
-                    under = at + np.uintp(stride)
-                    r = _dot2(flat, at, k00, k01) + _dot2(flat, under, k10, k11)
-                    g = _dot2(flat, at + np.uintp(1), k00, k01) + _dot2(flat, under + np.uintp(1), k10, k11)
-                    b = _dot2(flat, at + np.uintp(2), k00, k01) + _dot2(flat, under + np.uintp(2), k10, k11)
-                out[0, row, column] = np.uint8(min(max(r * gain_r + rounding, np.float32(0)), full))
-                out[1, row, column] = np.uint8(min(max(g * gain_g + rounding, np.float32(0)), full))
-                out[2, row, column] = np.uint8(min(max(b * gain_b + rounding, np.float32(0)), full))
-                edge = min(min(x - margin, x_last - x), min(y - margin, y_last - y)) + one
-                w *= min(edge / feather, one) * np.float32(sure)
-                out_trust[row, column] = sure
-                out_weight[row, column] = np.uint8(min(max(w + rounding, one), full))
+                    r, g, b = _linear(flat, stride, xi, yi, s, t)
+                out[0, row, column] = np.uint8(min(max(r * gain_r + rounding, zero), full))
+                out[1, row, column] = np.uint8(min(max(g * gain_g + rounding, zero), full))
+                out[2, row, column] = np.uint8(min(max(b * gain_b + rounding, zero), full))
+                out_vote[row, column] = np.uint8(min(max(c * ramp + rounding, one), full))
+                out_weight[row, column] = np.uint8(min(max((w0 + dw * u) * ramp + rounding, one), full))
 
 
 # --- photometry --------------------------------------------------------------------------------------------------
@@ -208,6 +227,17 @@ def _sort(rows, network):  # type: ignore[no-untyped-def]
             b[p] = y if x < y else x
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _distance(r0, g0, b0, r1, g1, b1):  # type: ignore[no-untyped-def]
+    """Distance of two colours in grey levels: mean of the channels, green twice."""
+    d = (
+        abs(np.int16(r0) - np.int16(r1))
+        + 2 * abs(np.int16(g0) - np.int16(g1))
+        + abs(np.int16(b0) - np.int16(b1))
+    )
+    return np.uint8((d + 2) >> 2)
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _weighted_median(values, weights, n):  # type: ignore[no-untyped-def]
     """The smallest value v such that values <= v hold half of the weight, by halving 0..255 eight times: sums
@@ -230,26 +260,23 @@ def _weighted_median(values, weights, n):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, spread):  # type: ignore[no-untyped-def]
+def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, spread):  # type: ignore[no-untyped-def]
     """One colour a pixel from n views.
 
-    stack (n, 3, N), trust (n, N), weight (n, N) uint8 as sample_view gives them; network = median_network(n).
+    stack (n, 3, N), vote (n, N), weight (n, N) uint8 as sample_view gives them; network = median_network(n).
     1. median per channel over the views that see the pixel (a missing one is padded with 0 and 255 in turn);
     2. distance d of each view to it (mean of channels, green twice), spread = 1.4826 median d;
-    3. where spread > doubt (grey levels), where views with 40 % of the weight are not near the median, or where a
-       view is only half trusted: a weighted median instead, because then it matters which views saw it best
-       (parallax, a player who stands in many of them). Votes are the root of the weight, times the root of the trust
-       that the weight already holds once: weights as they are let a few views decide, and a player in those is kept.
-       It costs 10 times the plain one, hence only there;
+    3. where spread > doubt (grey levels), or where 40 % of the votes are not near the median: the median by votes
+       instead, because then it matters who votes (one moment seen many times, parallax, half-trusted views). It
+       costs 10 times the plain one, hence only there;
     4. weighted mean of the views within 2 min(spread, cap) + floor of the median; the nearest view if none is.
-    One view: taken. Two: the heavier one is the centre. Out: out (N, 3), n_seen (N,), spread (N,), uint8.
+    One view: taken. Two: the one with more votes is the centre. Out: out (N, 3), n_seen (N,), spread (N,), uint8.
     """
     n, _, size = stack.shape
     rows = np.empty((n, _BLOCK), np.uint8)
     centre = np.empty((3, _BLOCK), np.uint8)
     apart = np.empty((n, _BLOCK), np.uint8)
     missing = np.empty(_BLOCK, np.uint8)
-    partial = np.empty(_BLOCK, np.uint8)
     median = np.empty(_BLOCK, np.uint8)
     total = np.empty((4, _BLOCK), np.float32)
     values = np.empty(n, np.int32)
@@ -262,18 +289,16 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
         length = min(_BLOCK, size - start)
         stop = start + length
         missing[:] = 0
-        partial[:] = 0
         for k in range(n):
-            seen = trust[k, start:stop]
+            seen = vote[k, start:stop]
             for p in range(length):
                 missing[p] += np.uint8(1) if seen[p] == 0 else np.uint8(0)
-                partial[p] |= np.uint8(1) if (seen[p] > 0) & (seen[p] < 250) else np.uint8(0)
         for c in range(4):
             pads = np.full(_BLOCK, first_pad, np.uint8)
             for k in range(n):
                 row = rows[k]
                 source = stack[k, c, start:stop] if c < 3 else apart[k, :length]
-                seen = trust[k, start:stop]
+                seen = vote[k, start:stop]
                 for p in range(length):
                     absent = np.uint8(1) if seen[p] == 0 else np.uint8(0)
                     pad = np.uint8(255) if pads[p] & np.uint8(1) else np.uint8(0)
@@ -290,61 +315,56 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
                 for k in range(n):
                     r, g, b = stack[k, 0, start:stop], stack[k, 1, start:stop], stack[k, 2, start:stop]
                     for p in range(length):
-                        d = (
-                            abs(np.int16(r[p]) - np.int16(centre[0, p]))
-                            + 2 * abs(np.int16(g[p]) - np.int16(centre[1, p]))
-                            + abs(np.int16(b[p]) - np.int16(centre[2, p]))
-                        )
-                        apart[k, p] = np.uint8((d + 2) >> 2)
+                        apart[k, p] = _distance(r[p], g[p], b[p], centre[0, p], centre[1, p], centre[2, p])
         total[:] = 0
         for k in range(n):
-            seen, share = trust[k, start:stop], weight[k, start:stop]
+            seen = vote[k, start:stop]
             for p in range(length):
-                w = np.float32(share[p]) if seen[p] > 0 else np.float32(0)
+                w = np.float32(seen[p])
                 limit = np.float32(2) * min(np.float32(1.4826) * median[p], cap) + floor
                 total[0, p] += w if apart[k, p] <= limit else np.float32(0)
                 total[1, p] += w
-        # Where the plain median may not be the right one: few views, disagreement, half-trusted views.
+        # Where the plain median may not be the right one: few views, disagreement, votes against it.
         for p in range(length):
-            count = n - missing[p]
-            n_seen[start + p] = count
-            sigma = np.float32(1.4826) * median[p]
-            spread[start + p] = np.uint8(min(sigma + np.float32(0.5), np.float32(255)))
-            outvoted = total[0, p] < np.float32(0.6) * total[1, p]
-            if count == 0 or not (count <= 2 or partial[p] or outvoted or sigma > doubt):
-                continue
             at = start + p
-            if count <= 2:
-                best = -1
-                for k in range(n):
-                    if trust[k, at] > 0 and (best < 0 or weight[k, at] > weight[best, at]):
-                        best = k
-                for c in range(3):
-                    centre[c, p] = stack[best, c, at]
-            else:
-                for k in range(n):
-                    votes[k] = np.sqrt(np.float32(weight[k, at]) * np.float32(trust[k, at]))
-                for c in range(3):
+            count = n - missing[p]
+            n_seen[at] = count
+            sigma = np.float32(1.4826) * median[p]
+            if count > 2 and sigma <= doubt and total[0, p] >= np.float32(0.6) * total[1, p]:
+                spread[at] = np.uint8(min(sigma + np.float32(0.5), np.float32(255)))
+                continue
+            if count == 0:
+                spread[at] = 0
+                continue
+            best = 0
+            for k in range(n):
+                votes[k] = vote[k, at]
+                if vote[k, at] > vote[best, at]:
+                    best = k
+            for c in range(3):
+                if count > 2:
                     for k in range(n):
                         values[k] = stack[k, c, at]
                     centre[c, p] = _weighted_median(values, votes, n)
+                else:
+                    centre[c, p] = stack[best, c, at]
             for k in range(n):
-                d = (
-                    abs(np.int16(stack[k, 0, at]) - np.int16(centre[0, p]))
-                    + 2 * abs(np.int16(stack[k, 1, at]) - np.int16(centre[1, p]))
-                    + abs(np.int16(stack[k, 2, at]) - np.int16(centre[2, p]))
+                apart[k, p] = _distance(
+                    stack[k, 0, at],
+                    stack[k, 1, at],
+                    stack[k, 2, at],
+                    centre[0, p],
+                    centre[1, p],
+                    centre[2, p],
                 )
-                apart[k, p] = np.uint8((d + 2) >> 2)
                 values[k] = apart[k, p]
-            if count > 2:
-                median[p] = _weighted_median(values, votes, n)
-            else:
-                # Two views have no spread of their own: they count as one place when they differ by noise only.
-                median[p] = 0
+            # Two views have no spread of their own: they count as one place when they differ by noise only.
+            median[p] = _weighted_median(values, votes, n) if count > 2 else 0
+            spread[at] = np.uint8(min(np.float32(1.4826) * median[p] + np.float32(0.5), np.float32(255)))
         total[:] = 0
         for k in range(n):
             r, g, b = stack[k, 0, start:stop], stack[k, 1, start:stop], stack[k, 2, start:stop]
-            seen, share = trust[k, start:stop], weight[k, start:stop]
+            seen, share = vote[k, start:stop], weight[k, start:stop]
             for p in range(length):
                 limit = np.float32(2) * min(np.float32(1.4826) * median[p], cap) + floor
                 near = (seen[p] > 0) & (apart[k, p] <= limit)
@@ -361,7 +381,7 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
             elif missing[p] < n:
                 best = -1
                 for k in range(n):
-                    if trust[k, at] > 0 and (best < 0 or apart[k, p] < apart[best, p]):
+                    if vote[k, at] > 0 and (best < 0 or apart[k, p] < apart[best, p]):
                         best = k
                 for c in range(3):
                     out[at, c] = stack[best, c, at]
@@ -372,14 +392,14 @@ def robust_value(stack, trust, weight, network, floor, cap, doubt, out, n_seen, 
 
 def blend_stack(
     stack: NDArray[np.uint8],
-    trust: NDArray[np.uint8],
+    vote: NDArray[np.uint8],
     weight: NDArray[np.uint8],
     *,
     floor: float = 3.0,
     cap: float = 10.0,
-    doubt: float = 5.0,
+    doubt: float = 6.0,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
-    """robust_value for a tile: stack (n, 3, h, w), trust and weight (n, h, w) uint8 -> image (h, w, 3), n_seen, spread.
+    """robust_value for a tile: stack (n, 3, h, w), vote and weight (n, h, w) uint8 -> image (h, w, 3), n_seen, spread.
 
     floor, cap, doubt in grey levels, see robust_value. Raises ValueError for no view or more than 255.
     """
@@ -390,7 +410,7 @@ def blend_stack(
     n_seen: NDArray[Any] = np.empty(height * width, np.uint8)
     spread: NDArray[Any] = np.empty(height * width, np.uint8)
     robust_value(
-        stack.reshape(n, 3, -1), trust.reshape(n, -1), weight.reshape(n, -1), median_network(n),
+        stack.reshape(n, 3, -1), vote.reshape(n, -1), weight.reshape(n, -1), median_network(n),
         np.float32(floor), np.float32(cap), np.float32(doubt), image, n_seen, spread,
     )  # fmt: skip
     return image.reshape(height, width, 3), n_seen.reshape(height, width), spread.reshape(height, width)

@@ -123,7 +123,7 @@ class _Scene:
     gains: NDArray[np.float32]  # (n, 3)
     lattice: Lattice
     floor: NDArray[np.float64]  # (ny, nx)
-    member: NDArray[np.bool_]  # (n, ny, nx)
+    vote: NDArray[np.float32]  # (n, ny, nx), 0 = does not count
     options: CompositeOptions
 
 
@@ -151,18 +151,19 @@ def composite(
         if k in store and k in by_frame and np.isfinite(by_frame[k].px_per_rad)
     ]
     lattice = lattice_of(surface)
-    views, floor, member = _final_views(stored, lattice, surface, options)
+    views, floor, vote = _final_views(stored, lattice, surface, options)
     gains = solve_gains(store, views, surface) if options.gains else np.ones((len(views), 3))
     scene = _Scene(
         surface=surface, store=store, views=views, gains=gains.astype(np.float32), lattice=lattice,
-        floor=floor.reshape(member.shape[1:]), member=member, options=options,
+        floor=floor.reshape(vote.shape[1:]), vote=vote, options=options,
     )  # fmt: skip
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     size = (surface.height, surface.width)
     image, alpha, n_seen, spread = (canvas.zeros(s) for s in ((*size, 3), size, size, size))
     step = options.tile_px
     # Column by column: a frame is about as high as the panorama, so tiles below each other share their frames.
-    tiles = [(x, y) for x in range(0, surface.width, step) for y in range(0, surface.height, step)]
+    columns, rows = range(0, surface.width, step), range(0, surface.height, step)
+    tiles = [(x, y) for i, x in enumerate(columns) for y in (rows[::-1] if i % 2 else rows)]
     local, lock, done = threading.local(), threading.Lock(), [0]
 
     def work(corner: tuple[int, int]) -> None:
@@ -191,16 +192,16 @@ def composite(
 
 def _final_views(
     stored: Sequence[Placement], lattice: Lattice, surface: Surface, options: CompositeOptions
-) -> tuple[tuple[Placement, ...], NDArray[np.float64], NDArray[np.bool_]]:
-    """Views in use, the resolution floor (p,) and which view counts where (n, ny, nx), with the final placements."""
+) -> tuple[tuple[Placement, ...], NDArray[np.float64], NDArray[np.float32]]:
+    """Views in use, the resolution floor (p,) and votes (n, ny, nx), with the final placements."""
     if not stored:
         raise ValueError("no stored frame has a placement: nothing to composite")
     rating = rate_views(stored, lattice, options)
-    member = share_views(stored, rating, lattice, surface.scale_px, options)
-    used = np.flatnonzero(member.any(axis=(1, 2)) & rating.quality.any(axis=1))
+    vote = share_views(stored, rating, lattice, surface.scale_px, options)
+    used = np.flatnonzero(vote.any(axis=(1, 2)) & rating.quality.any(axis=1))
     if not len(used):
         raise ValueError(f"none of {len(stored)} stored frames sees the panorama")
-    return tuple(stored[int(i)] for i in used), rating.floor, member[used]
+    return tuple(stored[int(i)] for i in used), rating.floor, vote[used]
 
 
 def _tile(
@@ -217,7 +218,7 @@ def _tile(
         local.flags = np.empty((2, most * side * side), np.uint8)
     n, area = len(maps), width * height
     stack = local.stack[: n * 3 * area].reshape(n, 3, height, width)
-    trust, weight = (plane[: n * area].reshape(n, height, width) for plane in local.flags)
+    vote, weight = (plane[: n * area].reshape(n, height, width) for plane in local.flags)
     nothing = np.zeros((1, 1), np.uint8)
     for row, (index, grid, step, shrink) in enumerate(maps):
         frame = scene.store.get(scene.views[index].frame, shrink)
@@ -225,9 +226,9 @@ def _tile(
             frame.rgb, nothing if frame.trust is None else frame.trust, frame.trust is not None, grid, step,
             scene.gains[index], np.float32(max(options.margin_px / shrink, 2.0)),
             np.float32(max(1.0, options.feather * frame.rgb.shape[1])), options.cubic,
-            stack[row], trust[row], weight[row],
+            stack[row], vote[row], weight[row],
         )  # fmt: skip
-    return blend_stack(stack, trust, weight, floor=options.floor, cap=options.cap, doubt=options.doubt)
+    return blend_stack(stack, vote, weight, floor=options.floor, cap=options.cap, doubt=options.doubt)
 
 
 def _tile_maps(
@@ -235,7 +236,7 @@ def _tile_maps(
 ) -> list[tuple[int, NDArray[np.float32], int, int]]:
     """(view, grid (rows, columns, 3), step, shrink) of the views that count in a tile, heaviest max_views of them."""
     near = _lattice_box(scene.lattice, x0, y0, width, height)
-    candidates = np.flatnonzero(scene.member[(slice(None), *near)].any(axis=(1, 2)))
+    candidates = np.flatnonzero(scene.vote[(slice(None), *near)].any(axis=(1, 2)))
     rays, checks = _tile_rays(scene.surface, x0, y0, width, height, GRID_PX)
     at = _lattice_at(scene.lattice, rays.shape[:2], x0, y0, GRID_PX)
     found = []
@@ -252,33 +253,36 @@ def _tile_maps(
                     break
         here = at if step == GRID_PX else _lattice_at(scene.lattice, xy.shape[:2], x0, y0, step)
         central = centrality(xy, placement.size_px, scene.options.margin_px)
-        sharp = _sharpness(resolution(placement), _floor(scene, *here))
-        sharp *= _bilinear(scene.member[index].astype(np.float32), *here)
-        if not (central * sharp).any():
-            continue
-        shrink = _shrink(xy, step)
-        grid = np.empty((*xy.shape[:2], 3), np.float32)
-        grid[..., :2] = np.where(np.isfinite(xy), (xy - (shrink - 1) / 2) / shrink, UNSEEN)
+        ratio = _ratio(resolution(placement), _floor(scene, *here))
+        vote = _bilinear(scene.vote[index], *here)
+        member = _bilinear((scene.vote[index] > 0).astype(np.float32), *here)
         # A cell cut by the frame's border must not lose its half inside because its outer corner weighs nothing;
         # the sampler tests the border itself, pixel by pixel.
-        grid[..., 2] = np.maximum(central, np.float32(0.04)) * sharp
-        found.append((float((central * sharp).sum()), int(index), grid, step, shrink))
+        inside = np.maximum(central, np.float32(0.04))
+        if not (central * ratio * vote).any():
+            continue
+        shrink = _shrink(xy, step)
+        grid = np.empty((*xy.shape[:2], 4), np.float32)
+        grid[..., :2] = np.where(np.isfinite(xy), (xy - (shrink - 1) / 2) / shrink, UNSEEN)
+        # To decide what stands still, who sees it best counts a little; to paint it, the sharp views count most.
+        grid[..., 2] = vote * (0.3 + 0.7 * inside) * ratio**2
+        grid[..., 3] = member * inside * ratio**4
+        found.append((float((central * grid[..., 3]).sum()), int(index), grid, step, shrink))
     if not found:
         return []
-    heaviest = max(float(entry[2][..., 2].max()) for entry in found)
-    for entry in found:  # the sampler stores weights in 8 bits: use all of them
-        entry[2][..., 2] /= heaviest
+    heaviest = np.max([entry[2][..., 2:].max(axis=(0, 1)) for entry in found], axis=0)
+    for entry in found:  # the sampler stores both in 8 bits: use all of them
+        entry[2][..., 2:] /= heaviest
     if len(found) > scene.options.max_views:
         found = sorted(sorted(found, key=lambda f: -f[0])[: scene.options.max_views], key=lambda f: f[1])
     return [entry[1:] for entry in found]
 
 
-def _sharpness(fineness: float, floor: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Weight by resolution: (its ratio to the floor, at most 2)^4, fading to 0 from the floor to 15 % below."""
+def _ratio(fineness: float, floor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Resolution over the floor's, at most 2, fading to 0 from the floor to 15 % below it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(floor > 0, fineness / floor, 1.0)
-    fade = np.clip((ratio - 0.85) / 0.15, 0.0, 1.0)
-    return (np.minimum(ratio, 2.0) ** 4 * fade).astype(np.float32)
+    return np.minimum(ratio, 2.0) * np.clip((ratio - 0.85) / 0.15, 0.0, 1.0)
 
 
 def _shrink(xy: NDArray[np.float64], step: int) -> int:

@@ -244,12 +244,12 @@ def share_views(
     lattice: Lattice,
     scale_px: float,
     options: CompositeOptions,
-) -> NDArray[np.bool_]:
-    """Which views count at which lattice point: (n, ny, nx). Between points their weights are interpolated.
+) -> NDArray[np.float32]:
+    """Votes 0..1 of the views at the lattice points, (n, ny, nx), 0 = does not count; interpolated in between.
 
-    At most K views a point (and a third of K from rare close-ups before them), far apart in time: a strip seen for
-    a moment only makes the store hold many frames of that moment, and they must not outvote the other views where
-    those exist. A point that fewer than K see also takes the frames that nearly reach it, nearest first: a frame
+    At most K views a point (a third of K from rare close-ups first), far apart in time. Views of one moment share
+    a vote: a player who stands still for two seconds is one observation, however often he was filmed meanwhile.
+    A point that fewer than K see also takes the frames that nearly reach it, nearest first: a frame
     that covers a part of a lattice cell may see none of its corners. scale_px: px per radian of the surface.
     """
     ny, nx = len(lattice.y_px), len(lattice.x_px)
@@ -273,7 +273,13 @@ def share_views(
         here = _spread_in_time(liked, time, options.views, here)
         here = _spread_in_time(near[:, :, column], None, options.views, here)
         taken[:, :, column] = before = here
-    return taken
+    return _independence(taken.reshape(len(placements), -1), time, options.min_span).reshape(shape)
+
+
+def _independence(taken: NDArray[np.bool_], time: NDArray[np.float64], span: float) -> NDArray[np.float32]:
+    """Vote (n, p) of each view taken: 1 / (1 + sum over the others of exp(-time apart / span))."""
+    alike = np.exp(-np.abs(time[:, None] - time) / span).astype(np.float32)
+    return np.where(taken, 1 / np.maximum(alike @ taken.astype(np.float32), 1.0), 0.0).astype(np.float32)
 
 
 def _spread_in_time(

@@ -9,10 +9,10 @@ from mosaic.blend import blend_stack, median_network, sample_view, solve_log_gai
 
 
 def sampled(image, x, y, *, cubic=True, gain=(1, 1, 1), trust=None, margin=2.0, feather=10.0, step=16):
-    """sample_view of a map x(i), y(j) (functions of tile pixels) over a 48 x 32 tile: out, trust, weight."""
+    """sample_view of a map x(i), y(j) (functions of tile pixels) over a 48 x 32 tile: out, vote, weight."""
     height, width = 32, 48
     columns, rows = (step * np.arange(n // step + 1.0) for n in (width, height))
-    grid = np.stack([*np.meshgrid(x(columns), y(rows)), np.ones((len(rows), len(columns)))], -1).astype(
+    grid = np.stack([*np.meshgrid(x(columns), y(rows)), *np.ones((2, len(rows), len(columns)))], -1).astype(
         np.float32
     )
     out, seen, weight = (
@@ -36,7 +36,7 @@ def ramp(width=120, height=80):
 def test_a_ramp_is_sampled_where_the_map_says(cubic):
     out, seen, _ = sampled(ramp(), lambda u: 20.25 + 0.75 * u, lambda v: 10.4 + 1.5 * v, cubic=cubic)
     u, v = np.arange(48), np.arange(32)
-    assert (seen == 255).all()
+    assert (seen > 0).all()
     # A sample is rounded to whole grey levels: half a level either way, and nothing more.
     assert np.abs(out[0] - 2 * (20.25 + 0.75 * u)).max() <= 0.501
     assert np.abs(out[1] - 3 * (10.4 + 1.5 * v)[:, None]).max() <= 0.501
@@ -52,7 +52,7 @@ def test_a_half_pixel_shift_would_be_seen(cubic):
 
 def test_frame_border_is_left_out_and_feathered():
     _, seen, weight = sampled(ramp(), lambda u: u - 4.0, lambda v: 20.0 + v, margin=3.0, feather=10.0)
-    assert (seen[:, :7] == 0).all() and (seen[:, 7:] == 255).all()
+    assert (seen[:, :7] == 0).all() and (seen[:, 7:] > 0).all()
     assert (weight[:, :7] == 0).all() and weight[0, 7] == 26  # a tenth of 255
     assert (np.diff(weight[0, 7:17].astype(int)) > 0).all() and (weight[:, 17:] == 255).all()
 
@@ -97,8 +97,8 @@ def stack_of(n, seed=0, noise=2.0, size=(8, 300)):
 
 
 def test_noise_falls_as_in_a_mean_not_as_in_a_median():
-    truth, stack, trust, weight = stack_of(17)
-    image, n_seen, spread = blend_stack(stack, trust, weight)
+    truth, stack, vote, weight = stack_of(17)
+    image, n_seen, spread = blend_stack(stack, vote, weight)
     error = np.std(image - truth)
     # 2 / sqrt(17) = .49 and .29 of rounding make .56; a median would have 1.25 times the .49, so .67.
     assert error < 0.62
@@ -106,58 +106,58 @@ def test_noise_falls_as_in_a_mean_not_as_in_a_median():
 
 
 def test_outliers_in_under_half_of_the_views_leave_no_trace():
-    truth, stack, trust, weight = stack_of(17)
+    truth, stack, vote, weight = stack_of(17)
     stack[:7] = np.array([250, 10, 10], np.uint8)[:, None, None]
-    image, _, _ = blend_stack(stack, trust, weight)
+    image, _, _ = blend_stack(stack, vote, weight)
     assert np.abs(image - truth).max() < 6 and np.abs((image - truth).mean()) < 0.5
 
 
 def test_views_that_do_not_see_a_pixel_do_not_count():
-    truth, stack, trust, weight = stack_of(9)
+    truth, stack, vote, weight = stack_of(9)
     stack[4:] = 0
-    trust[4:] = 0
+    vote[4:] = 0
     weight[4:] = 0
-    image, n_seen, _ = blend_stack(stack, trust, weight)
+    image, n_seen, _ = blend_stack(stack, vote, weight)
     assert (n_seen == 4).all() and np.std(image - truth) < 1.6
-    trust[:] = 0
-    image, n_seen, _ = blend_stack(stack, trust, weight)
+    vote[:] = 0
+    image, n_seen, _ = blend_stack(stack, vote, weight)
     assert not image.any() and not n_seen.any()
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
 @pytest.mark.parametrize("extra", [0, 1, 2, 3])
 def test_missing_views_do_not_shift_the_median(n, extra):
-    truth, stack, trust, weight = stack_of(n + extra, noise=1.0)
-    trust[n:] = 0
+    truth, stack, vote, weight = stack_of(n + extra, noise=1.0)
+    vote[n:] = 0
     stack[n:] = 255
-    image, _, _ = blend_stack(stack, trust, weight)
+    image, _, _ = blend_stack(stack, vote, weight)
     # Halves are rounded up: of two views the mean is a half in every second pixel, which makes .25.
     assert abs(float((image - truth).mean())) < (0.3 if n == 2 else 0.15)
 
 
-def test_two_views_that_differ_give_the_heavier_one_whole_not_a_mixture():
+def test_two_views_that_differ_give_the_better_one_whole_not_a_mixture():
     size = (4, 5)
     stack = np.zeros((2, 3, *size), np.uint8)
     stack[0], stack[1] = 40, np.array([200, 20, 90], np.uint8)[:, None, None]
-    trust = np.full((2, *size), 255, np.uint8)
-    weight = np.stack([np.full(size, 100, np.uint8), np.full(size, 140, np.uint8)])
-    image, _, _ = blend_stack(stack, trust, weight)
+    weight = np.full((2, *size), 255, np.uint8)
+    vote = np.stack([np.full(size, 100, np.uint8), np.full(size, 140, np.uint8)])
+    image, _, _ = blend_stack(stack, vote, weight)
     assert (image == [200, 20, 90]).all()
 
 
 def test_low_trust_in_the_many_lets_the_trusted_few_win():
-    truth, stack, trust, weight = stack_of(11)
+    truth, stack, vote, weight = stack_of(11)
     stack[:8] = 230  # a player who stands there in most views, and is known to be one
-    trust[:8], weight[:8] = 25, 25
-    image, _, _ = blend_stack(stack, trust, weight)
+    vote[:8] = 25
+    image, _, _ = blend_stack(stack, vote, weight)
     assert np.abs(image - truth).max() < 9
 
 
-def test_where_views_disagree_the_heavier_ones_decide():
-    _, stack, trust, weight = stack_of(9, noise=0.0, size=(2, 2))
+def test_where_views_disagree_the_votes_decide():
+    _, stack, vote, weight = stack_of(9, noise=0.0, size=(2, 2))
     stack[:4], stack[4:] = 60, 180
-    weight[:4], weight[4:] = 250, 60
-    image, _, _ = blend_stack(stack, trust, weight)
+    vote[:4], vote[4:] = 250, 60
+    image, _, _ = blend_stack(stack, vote, weight)
     assert (image == 60).all()
 
 

@@ -329,3 +329,22 @@ def test_canvas_beyond_its_budget_is_a_file_that_keeps_its_data(tmp_path):
     large[7:9, :, 1], small[3] = 9, 4
     canvas.release()
     assert large[8, 5, 1] == 9 and large.sum() == 9 * 800 and small.sum() == 40
+
+
+def test_one_long_look_does_not_outvote_three_short_ones(tmp_path):
+    # A player stands still while the camera rests on him for 75 frames; later it passes the place three times.
+    rest = [Pinhole(frame=3 * k, size_px=(240, 136), pan_deg=0.02 * k) for k in range(25)]
+    passes = [
+        Pinhole(frame=400 * i + k, size_px=(240, 136), pan_deg=2.0 * k) for i in (1, 2, 3) for k in (-1, 1)
+    ]
+    frames = [*rest, *passes]
+    surface = choose_surface(frames, "cylindrical")
+    pictures = [picture(p) for p in frames]
+    for placement, rgb in zip(rest, pictures, strict=False):
+        x, y = np.rint(placement.ray_to_pixel(np.array([0.0, 0.0, 1.0]))).astype(int)
+        rgb[y - 10 : y + 10, x - 5 : x + 5] = 255
+    panorama = composite_of(tmp_path, frames, surface, pictures)
+    x, y = np.rint(surface.ray_to_pixel([0.0, 0.0, 1.0])).astype(int)
+    where = np.s_[y - 8 : y + 8, x - 4 : x + 4]
+    assert panorama.n_seen[where].min() >= 17
+    assert np.abs(panorama.image[where] - clean_plate(surface)[where]).mean() < 3
