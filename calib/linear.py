@@ -68,47 +68,80 @@ class TreeEdge(NamedTuple):
     forward: bool
 
 
-def inconsistency_px(packed: Packed) -> Array:
-    """How far each edge (E,) disagrees with the triangles it is part of: median px at the centre and four points.
+def triangle_gaps(packed: Packed) -> tuple[NDArray[np.int64], Array]:
+    """Triangles of edges (t, 3) by edge number, and how far going round each is from the identity (t,), px.
 
-    0 where an edge is in no triangle. A wrong edge disagrees with all its triangles, a good one with few.
+    Mean over five points of the picture. Each edge's own H is taken; distortion and parallax leave a few px.
     """
     W, H = packed.size_px
     probe = np.array([[0.5, 0.5], [0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.7, 0.7]]) * np.array([W, H])
-    lookup: dict[tuple[int, int], int] = {}
+    finite = np.asarray(np.isfinite(packed.H).all((-1, -2)))
+    lookup: dict[tuple[int, int], tuple[int, bool]] = {}
     neighbours: dict[int, set[int]] = {}
     for k, (a, b) in enumerate(zip(packed.ia.tolist(), packed.ib.tolist(), strict=True)):
-        lookup[a, b] = k
-        neighbours.setdefault(a, set()).add(b)
-        neighbours.setdefault(b, set()).add(a)
-    inverse = homography.invert(packed.H) if packed.n_edges else packed.H
-    triples: list[tuple[int, Array, Array]] = []
-    for (a, b), k in lookup.items():
-        for c in sorted(neighbours[a] & neighbours[b])[:8]:
-            first = packed.H[lookup[a, c]] if (a, c) in lookup else inverse[lookup[c, a]]
-            second = packed.H[lookup[c, b]] if (c, b) in lookup else inverse[lookup[b, c]]
-            triples.append((k, first, second))
-    out = np.zeros(packed.n_edges)
-    if not triples:
-        return out
-    index = np.array([t[0] for t in triples])
-    through = homography.normalise(np.array([t[2] for t in triples]) @ np.array([t[1] for t in triples]))
-    gap = np.linalg.norm(homography.apply(through, probe) - homography.apply(packed.H[index], probe), axis=-1)
-    gap = np.where(np.isfinite(gap), gap, 1e4).mean(-1)
-    for k in np.unique(index):
-        out[k] = np.median(gap[index == k])
-    return out
+        if finite[k]:
+            lookup[a, b], lookup[b, a] = (k, True), (k, False)
+            neighbours.setdefault(a, set()).add(b)
+            neighbours.setdefault(b, set()).add(a)
+    corners = [
+        (a, b, c)
+        for a in sorted(neighbours)
+        for b in sorted(n for n in neighbours[a] if n > a)
+        for c in sorted(n for n in neighbours[a] & neighbours[b] if n > b)
+    ]
+    if not corners:
+        return np.zeros((0, 3), int), np.zeros(0)
+    inverse = homography.invert(np.where(finite[:, None, None], packed.H, np.eye(3)))
+
+    def mapping(src: int, dst: int) -> Array:
+        k, forward = lookup[src, dst]
+        return np.asarray(packed.H[k] if forward else inverse[k])
+
+    there = homography.normalise(np.array([mapping(b, c) @ mapping(a, b) for a, b, c in corners]))
+    direct = np.array([mapping(a, c) for a, _, c in corners])
+    gap = np.linalg.norm(homography.apply(there, probe) - homography.apply(direct, probe), axis=-1)
+    edges = np.array([[lookup[a, b][0], lookup[b, c][0], lookup[a, c][0]] for a, b, c in corners])
+    return edges, np.where(np.isfinite(gap), gap, 1e4).mean(-1)
 
 
-def spanning_tree(packed: Packed, root: int | NDArray[np.int64], frames: NDArray[np.int64]) -> list[TreeEdge]:
-    """Steps from the root row(s) outwards over the best-agreeing, shortest edges, in breadth-first order.
+def consistent_edges(packed: Packed, frames: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Edges (E,) left when those that break most triangles are taken away one by one.
 
-    Frames without a path are not in the list. Edges without information are not used.
+    A triangle is broken beyond 1.2 % of the width and five times the median. Among equals the longest gap goes: what
+    was tracked over fewer frames is more likely right.
+    """
+    edges, gap = triangle_gaps(packed)
+    keep = np.ones(packed.n_edges, bool)
+    if not len(edges):
+        return keep
+    broken = gap > max(0.012 * packed.size_px[0], 5 * float(np.median(gap)))
+    span = np.abs(frames[packed.ia] - frames[packed.ib]).astype(float)
+    preference = np.sqrt(span / max(float(np.median(span)), 1.0))
+    while broken.any():
+        score = np.bincount(edges[broken].ravel(), minlength=packed.n_edges) * preference
+        worst = int(np.argmax(score))
+        keep[worst] = False
+        broken &= ~(edges == worst).any(1)
+    return keep
+
+
+def spanning_tree(
+    packed: Packed,
+    root: int | NDArray[np.int64],
+    frames: NDArray[np.int64],
+    trusted: NDArray[np.bool_] | None = None,
+) -> list[TreeEdge]:
+    """Steps from the root row(s) outwards over the shortest trusted edges, in breadth-first order.
+
+    An edge outside `trusted` (E,) is used only where nothing else leads. Frames without a path are not in the list.
+    Edges without information are not used.
     """
     n = packed.n_frames
     usable = packed.dof.sum(1) >= 8
     gap = np.abs(frames[packed.ia] - frames[packed.ib]).astype(float)
-    weight = 1 + gap / max(gap.max(initial=1.0), 1.0) + inconsistency_px(packed)
+    weight = 1 + gap / max(gap.max(initial=1.0), 1.0)
+    if trusted is not None:
+        weight = weight + np.where(trusted, 0.0, 1e3)
     best: dict[tuple[int, int], int] = {}
     for k in np.flatnonzero(usable).tolist():
         a, b = int(packed.ia[k]), int(packed.ib[k])

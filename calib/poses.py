@@ -179,7 +179,7 @@ def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions 
     n_steps, converged, cost, matrix = 0, True, 0.0, None
     system = _PoseSystem(packed.select(ok), free)
     loss = Loss("huber", np.ones(1), options.huber)
-    for _ in range(3):
+    for _ in range(5):
         fit = ok & (free[packed.ia] | free[packed.ib])
         if not fit.any():
             break
@@ -190,7 +190,7 @@ def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions 
         state, cost, converged, steps, matrix = _iterate(chosen, system, state, loss, options)
         n_steps += steps
         # Judged anew each time: an edge that a wrong one had pulled away comes back.
-        now = ~find_bad_edges(whitened_squares(packed, state)[0], packed, options.bad_edge)
+        now = ~find_bad_edges(whitened_squares(packed, state)[0], packed, options.bad_edge, ok)
         reach = linked_to(packed, now, is_held)
         now &= reach[packed.ia] & reach[packed.ib]
         if (now == ok).all():

@@ -31,7 +31,8 @@ from calib.solver import Layout, NormalEquations, Result, minimise
 
 Array = NDArray[np.float64]
 # The loss scale is the fixed point of fit and median residual, so that it does not depend on where a fit began.
-MAX_LOOKS = 8
+MAX_LOOKS = 10
+WORST_FIRST = 0.4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,17 +95,25 @@ def linked_to(packed: Packed, ok: NDArray[np.bool_], roots: NDArray[np.bool_]) -
     return np.isin(label, np.unique(label[roots]))
 
 
-def find_bad_edges(e2: Array, packed: Packed, limit: float) -> NDArray[np.bool_]:
+def find_bad_edges(
+    e2: Array, packed: Packed, limit: float, fitted: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
     """Edges (E,) whose median whitened residual is beyond `limit` times the graph's median (at least the stated noise).
 
     The median of an edge ignores players and boards that move; a wrong registration moves all of its points.
+    fitted: the edges that made this fit; of those only the worst go (WORST_FIRST of the largest), because a wrong
+    edge drags its neighbours along.
     """
     e = np.sqrt(np.where(packed.dof > 0, np.minimum(e2, 1e12), np.nan))
     known = packed.dof.sum(1) > 0
     median = np.full(packed.n_edges, np.inf)
     median[known] = np.nanmedian(e[known], axis=1)
-    typical = max(float(np.median(median[known])) if known.any() else 1.0, 1.0)
-    return median > limit * typical
+    used = known if fitted is None else known & fitted
+    typical = max(float(np.median(median[used])) if used.any() else 1.0, 1.0)
+    bad = median > limit * typical
+    if fitted is not None and (bad & used).any():
+        bad &= ~used | (median > WORST_FIRST * median[bad & used].max())
+    return bad
 
 
 def multistart_states(
@@ -177,12 +186,16 @@ def _from_scratch(
 ) -> tuple[State, NDArray[np.bool_], NDArray[np.bool_], tuple[StartResult, ...], float, Array] | None:
     """Best state (S = 1), accepted edges, free columns, starts, valid share, loss scale; None: nothing is possible."""
     priors, size_px = prior_args
-    tree = linear.spanning_tree(packed, reference, frames)
+    trusted = linear.consistent_edges(packed, frames)
+    linked = linked_frames(packed, trusted, reference)
+    # A frame that only doubtful edges reach keeps them: the fit decides.
+    trusted |= ~(linked[packed.ia] & linked[packed.ib])
+    tree = linear.spanning_tree(packed, reference, frames, trusted)
     names, states, share = multistart_states(packed, tree, reference, priors, options)
     zoom_range = float(np.median(np.ptp(states.log_f, axis=1)))
     free = free_columns(priors, options, zoom_range)
     terms = PriorTerms(priors, size_px, frames, free)
-    coarse = packed.thin(options.thin)
+    coarse = packed.select(trusted).thin(options.thin)
     layout = Layout(coarse, reference, free)
 
     # 1. A coarse look: few points an edge, the scale that each start has itself.
@@ -207,10 +220,9 @@ def _from_scratch(
     if not len(alive):
         return None
     leader = alive[np.argmin(scale[alive])]
-    ok = ~find_bad_edges(
-        whitened_squares(packed, result.state.pick(np.array([leader])))[0], packed, options.bad_edge
-    )
-    ok = ok if ok.any() else np.ones_like(ok)
+    e2_leader = whitened_squares(packed, result.state.pick(np.array([leader])))[0]
+    ok = ~find_bad_edges(e2_leader, packed, options.bad_edge, trusted)
+    ok = ok if ok.any() else trusted
     common = Loss("huber", np.full(len(alive), scale[leader]), options.huber)
     here = result.state.pick(alive)
     fine = packed.select(ok)
@@ -371,7 +383,7 @@ def polish(
         n_steps += int(rough.n_steps[0])
         state = rough.state
         e2 = whitened_squares(packed, state)
-        now = ~find_bad_edges(e2[0], packed, options.bad_edge)
+        now = ~find_bad_edges(e2[0], packed, options.bad_edge, ok)
         now &= linked_pairs(packed, now, row)
         now = now if now.any() else ok
         new_scale = robust_scale(e2[:, now], packed.dof[now])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import rotation
+from calib import dlt, rotation
 from calib.camera import infinite_homography
 from calib.records import HomographyEdge, HomographyGraph, Lens
 
@@ -89,6 +89,8 @@ def edge(
         seen = seen + shift_px * np.array([1.0, -0.7]) + smooth_field(rng, points, size, shift_px / 3)
     K_a, K_b = truth.lens.K(truth.log_f[a]), truth.lens.K(truth.log_f[b])
     H = infinite_homography(K_b, K_a, truth.R[b] @ truth.R[a].T)
+    if shift_px:
+        H = dlt.dlt(points, seen)
     info = np.broadcast_to(np.eye(2) / 0.1**2, (len(points), 2, 2))
     return HomographyEdge(
         a=int(truth.frames[a]), b=int(truth.frames[b]), H=H, grid_a=points, grid_b=seen, info=info
