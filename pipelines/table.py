@@ -60,9 +60,12 @@ def shot_rows(
     sigma_zoom = np.where(solved, solution.sigma_log_zoom[at], np.nan)
     bridged = have & ~solved
     if solved.any():
-        sigma_stat[bridged] = INTERPOLATED_INFLATION * np.nanmax(sigma_stat[solved])
-        sigma_zoom[bridged] = INTERPOLATED_INFLATION * max(float(np.nanmax(sigma_zoom[solved])), 1e-4)
-    systematic = float(verdict.sigma_parts.get("systematic", 0.0)) if claims else np.nan
+        for sigma in (sigma_stat, sigma_zoom):
+            known = sigma[solved & np.isfinite(sigma)]
+            sigma[bridged] = INTERPOLATED_INFLATION * known.max() if len(known) else np.nan
+    # What all frames share beyond the statistical part: lens model, parallax (calib.gates).
+    common = float(verdict.sigma_parts.get("cluster", 0.0))
+    systematic = float(np.sqrt(max(verdict.sigma_log_f_total**2 - common**2, 0.0))) if claims else np.nan
     sigma_total = np.sqrt(sigma_stat**2 + systematic**2)
     f = np.exp(log_f)
     reference = row_of.get(solution.reference)
