@@ -161,9 +161,8 @@ def composite(
     size = (surface.height, surface.width)
     image, alpha, n_seen, spread = (canvas.zeros(s) for s in ((*size, 3), size, size, size))
     step = options.tile_px
-    # Column by column: a frame is about as high as the panorama, so tiles below each other share their frames.
-    columns, rows = range(0, surface.width, step), range(0, surface.height, step)
-    tiles = [(x, y) for i, x in enumerate(columns) for y in (rows[::-1] if i % 2 else rows)]
+    # Row by row: neighbours share most of their frames, so the store's cache holds one tile's views and that is enough.
+    tiles = [(x, y) for y in range(0, surface.height, step) for x in range(0, surface.width, step)]
     local, lock, done = threading.local(), threading.Lock(), [0]
 
     def work(corner: tuple[int, int]) -> None:
@@ -220,12 +219,15 @@ def _tile(
     stack = local.stack[: n * 3 * area].reshape(n, 3, height, width)
     vote, weight = (plane[: n * area].reshape(n, height, width) for plane in local.flags)
     nothing = np.zeros((1, 1), np.uint8)
+    strongest = max(float(grid[..., 3].max()) for _, grid, _, _ in maps)
     for row, (index, grid, step, shrink) in enumerate(maps):
+        # Views that hardly count in the mean only help to find the median: linear is good enough, at half the time.
+        cubic = options.cubic and float(grid[..., 3].max()) > 0.2 * strongest
         frame = scene.store.get(scene.views[index].frame, shrink)
         sample_view(
             frame.rgb, nothing if frame.trust is None else frame.trust, frame.trust is not None, grid, step,
             scene.gains[index], np.float32(max(options.margin_px / shrink, 2.0)),
-            np.float32(max(1.0, options.feather * frame.rgb.shape[1])), options.cubic,
+            np.float32(max(1.0, options.feather * frame.rgb.shape[1])), cubic,
             stack[row], vote[row], weight[row],
         )  # fmt: skip
     return blend_stack(stack, vote, weight, floor=options.floor, cap=options.cap, doubt=options.doubt)

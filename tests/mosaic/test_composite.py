@@ -276,6 +276,18 @@ def test_store_gives_back_what_it_was_given_and_keeps_its_budget(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_picture_in_hand_is_not_overwritten_by_later_reads(tmp_path):
+    with FrameStore(tmp_path, (96, 64), cache_bytes=1) as store:
+        for k in range(20):
+            store.put(k, np.full((64, 96, 3), k, np.uint8))
+        held = [store.get(k) for k in range(0, 20, 4)]
+        views = [store.get(k).rgb[3:5] for k in range(1, 20, 4)]
+        for k in range(20):
+            assert (store.get(k).rgb == k).all()
+        assert [int(h.rgb.max()) for h in held] == [0, 4, 8, 12, 16]
+        assert [int(v.max()) for v in views] == [1, 5, 9, 13, 17]
+
+
 def test_store_refuses_what_does_not_fit(tmp_path):
     with FrameStore(tmp_path, (96, 64)) as store:
         good = np.zeros((64, 96, 3), np.uint8)
