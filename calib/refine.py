@@ -87,6 +87,15 @@ def linked_frames(packed: Packed, ok: NDArray[np.bool_], reference: int) -> NDAr
     return np.asarray(label == label[reference])
 
 
+def largest_component(packed: Packed, ok: NDArray[np.bool_]) -> tuple[int, int]:
+    """Number of frames and first row of the largest set of frames that accepted edges join."""
+    n = packed.n_frames
+    link = coo_array((np.ones(int(ok.sum())), (packed.ia[ok], packed.ib[ok])), shape=(n, n))
+    _, label = connected_components(link, directed=False)
+    best = int(np.argmax(np.bincount(label)))
+    return int(np.sum(label == best)), int(np.flatnonzero(label == best)[0])
+
+
 def linked_to(packed: Packed, ok: NDArray[np.bool_], roots: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Frames (n,) that accepted edges join to any of the root frames (n,) bool."""
     n = packed.n_frames
@@ -222,7 +231,7 @@ def _from_scratch(
     leader = alive[np.argmin(scale[alive])]
     e2_leader = whitened_squares(packed, result.state.pick(np.array([leader])))[0]
     ok = ~find_bad_edges(e2_leader, packed, options.bad_edge, trusted)
-    ok = ok if ok.any() else trusted
+    ok = ok if ok.any() and linked_frames(packed, ok, reference).all() else trusted
     common = Loss("huber", np.full(len(alive), scale[leader]), options.huber)
     here = result.state.pick(alive)
     fine = packed.select(ok)
@@ -326,7 +335,8 @@ def refine(
 
     graph: keyframes and their edges (raw px). start: an earlier solution; frames missing in it are chained on.
     Returns a Solution; frames that no accepted edge links to the reference are NaN rows; on data that cannot be solved
-    converged is False and sigmas are NaN. Raises ValueError for a reference that is not in the graph, or no frame.
+    converged is False and sigmas are NaN. A reference whose edges all prove wrong gives way to a frame of the largest
+    linked set (Solution.reference says which). Raises ValueError for a reference that is not in the graph, or no frame.
     Source: calibration.md 6 and 7.3; real-footage.md 2 for the stopping rule.
     """
     priors, options = priors or Priors(), options or RefineOptions()
@@ -364,6 +374,11 @@ def refine(
     terms = PriorTerms(priors, graph.size_px, frames, free)
     result, ok, loss = polish(packed, row, terms, state, ok, scale, free, options)
     linked = linked_frames(packed, ok, row)
+    if 2 * linked.sum() < packed.n_frames:
+        other = largest_component(packed, ok)
+        if other[0] > linked.sum():
+            moved = replace(options, reference=int(frames[other[1]]))
+            return refine(graph, start=start, priors=priors, options=moved)
     solution = summarise(packed, frames, row, terms, result, ok, loss, linked, priors, starts, share)
     return solution if inside.all() else _spread(solution, graph, inside)
 
@@ -373,7 +388,7 @@ def polish(
     free: NDArray[np.bool_], options: RefineOptions,
 ) -> tuple[Result, NDArray[np.bool_], Loss]:  # fmt: skip
     """Re-estimate scale and bad edges around one state until both stay, then iterate to the end."""
-    n_steps = 0
+    n_steps, tried = 0, np.zeros(packed.n_edges, bool)
     for look in range(MAX_LOOKS):
         loss = Loss("huber", scale, options.huber)
         rough = minimise(
@@ -384,7 +399,11 @@ def polish(
         state = rough.state
         e2 = whitened_squares(packed, state)
         now = ~find_bad_edges(e2[0], packed, options.bad_edge, ok)
-        now &= linked_pairs(packed, now, row)
+        bridge = find_bridge(e2[0], packed, now, tried, row)
+        if bridge >= 0:
+            now[bridge] = tried[bridge] = True
+        else:
+            now &= linked_pairs(packed, now, row)
         now = now if now.any() else ok
         new_scale = robust_scale(e2[:, now], packed.dof[now])
         settled = bool((now == ok).all()) and abs(float(new_scale[0] / scale[0]) - 1) < 1e-4
@@ -400,6 +419,21 @@ def polish(
     )
     result.n_steps[0] += n_steps
     return result, ok, loss
+
+
+def find_bridge(e2: Array, packed: Packed, ok: NDArray[np.bool_], tried: NDArray[np.bool_], row: int) -> int:
+    """The least bad rejected edge between the linked frames and others, -1 for none or when all were tried.
+
+    Where three frames hang on one triangle, a wrong edge makes all three edges look wrong; each gets one chance.
+    """
+    linked = linked_frames(packed, ok, row)
+    crossing = np.flatnonzero((linked[packed.ia] != linked[packed.ib]) & ~tried & ~ok)
+    if not len(crossing):
+        return -1
+    # The shortest first: what was tracked over fewer frames is more likely right.
+    span = np.abs(packed.ia[crossing] - packed.ib[crossing])
+    median = np.median(np.where(packed.dof[crossing] > 0, e2[crossing], np.inf), axis=1)
+    return int(crossing[np.lexsort((median, span))[0]])
 
 
 def linked_pairs(packed: Packed, ok: NDArray[np.bool_], row: int) -> NDArray[np.bool_]:
