@@ -217,7 +217,7 @@ def _judge(
     if score > options.score_ok:
         status, reason = PairStatus.WEAK, "score"
     _, _, A = source.family.warp(state, source.prepared[index])
-    flow = _flow_grid(source, target, index, fine, A, gain, offset, masks, options, kernel)
+    flow = _flow_grid(source, target, index, state, fine, A, gain, offset, masks, options, kernel)
     if len(flow.cell) < 6:
         return _failed(template.frame, dst, template.size_px, "no_texture", route, n_steps, score=score)
     H, info9 = fit_homography_to_flow(flow.src_px, flow.dst_px, flow.info, _warp_homography(level.src_px, fine.dst))
@@ -282,6 +282,7 @@ def _flow_grid(
     source: PreparedTemplate,
     target: Pyramid,
     index: int,
+    state: Any,
     fine: _Linearised,
     A: FloatArray,
     gain: float,
@@ -324,10 +325,15 @@ def _flow_grid(
     keep = (S[:, 0] > 0) & (counts[:, 1] >= 6) & known.any(axis=1)
     # A shift beyond the linear range is no measurement, nor is one that still moves.
     keep &= (np.abs(shift).max(axis=1) <= options.cell_linear_px) & (np.abs(step).max(axis=1) < 0.25)
-    total = np.where(keep, S[:, 0], 1.0)[:, None]
+    if not keep.any():
+        return FlowGrid.empty()
+    src_px = S[keep, 1:3] / S[keep, 0:1]
+    # The warp of the centroid, not the centroid of the warped pixels: over a cell of 240 px a pan of 8 degrees bends the
+    # warp by .3 px, always to the same side (measured: 1.6 % of focal).
+    where, _, _ = source.family.warp(state, source.family.prepare(src_px))
     return FlowGrid(
-        src_px=(S[:, 1:3] / total)[keep],
-        dst_px=(S[:, 3:5] / total + step)[keep],
+        src_px=src_px,
+        dst_px=where + shift[keep],
         info=np.einsum("cij,cj,ckj->cik", vectors, info, vectors)[keep],
         weight=(counts[:, 1] / np.maximum(counts[:, 0], 1.0))[keep],
         cell=np.flatnonzero(keep),
