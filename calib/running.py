@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import rotation, serial
-from calib.gates import GateOptions, coherent_px
+from calib.gates import GateOptions, systematic_px
 from calib.problem import AdaptiveLoss, Linearised, Packed, State, linearise, pack, robust_scale
 from calib.records import HomographyEdge, HomographyGraph, Lens, Priors, Solution
 from calib.refine import RefineOptions, refine, state_from_solution
@@ -248,11 +248,7 @@ class RunningCalibrator:
         return replace(solution, R=solution.R @ turn)
 
     def _score(self, solution: Solution, graph: HomographyGraph) -> None:
-        gates = self.options.gates
-        s_px = gates.systematic_floor_px * self.size_px[0] / 1280
-        coherent = coherent_px(solution, graph)
-        if np.isfinite(coherent):
-            s_px = max(s_px, gates.coherent_gain * coherent)
+        s_px = systematic_px(solution, graph, self.options.gates)["systematic_px"]
         self._systematic = 0.1 * s_px / solution.s10_px if solution.s10_px > 0 else math.inf
         sigma = solution.sigma_mean_log_f
         zoom = (

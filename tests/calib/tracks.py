@@ -56,6 +56,28 @@ def project(truth: Truth, a: int, b: int, points: Array) -> Array:
     return np.where(w[:, 2:] > 0, out, np.nan)
 
 
+def parallax(truth: Truth, a: int, b: int, points: Array, pupil_m: float, tilt0_deg: float = -8.0) -> Array:
+    """Displacement (m, 2) px in row b of points of row a by a pupil in front of the pan axis.
+
+    The scene: a pitch 15 m below the axis, a stand 95 m away all around. truth made by `path` with this tilt0_deg.
+    """
+    lens, level = truth.lens, rotation.from_pan_tilt_roll(0.0, np.deg2rad(tilt0_deg), 0.0)
+    R_a, R_b = truth.R[a] @ level, truth.R[b] @ level
+    ideal = lens.undistort(points, truth.log_f[a])
+    rays = (
+        np.concatenate([ideal, np.ones((len(ideal), 1))], 1) @ np.linalg.inv(lens.K(truth.log_f[a])).T @ R_a
+    )
+    down = np.where(rays[:, 1] > 1e-6, rays[:, 1], 1e-6)
+    scene = rays * np.minimum(15 / down, 95 / np.hypot(rays[:, 0], rays[:, 2]))[:, None]
+
+    def seen(pupil: float) -> Array:
+        # The ray of a starts at a's pupil; the scene is far away, so its point is taken from the axis.
+        w = (scene + pupil * (R_a[2] - R_b[2])) @ R_b.T @ lens.K(truth.log_f[b]).T
+        return lens.distort(w[:, :2] / w[:, 2:], truth.log_f[b])
+
+    return seen(pupil_m) - seen(0.0)
+
+
 def grid(size_px: tuple[int, int]) -> Array:
     """Centres (40, 2) of the 8 x 5 cells, row by row."""
     x, y = np.meshgrid((np.arange(8) + 0.5) / 8, (np.arange(5) + 0.5) / 5)
