@@ -174,6 +174,8 @@ class NormalEquations:
         out[np.ix_(order, order)] = self._bordered(0.0, np.eye(len(order)))
         return out
 
+NOTHING_TO_GAIN = 1e-7  # of the cost: some 1e-4 of one chi-square unit on a keyframe graph
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
@@ -214,6 +216,7 @@ def minimise(
         stop[k] = "impossible_start"
     log_f, R, shared = state.log_f.copy(), state.R.copy(), state.shared.copy()
     blocks, gradient, e2 = lin.blocks, lin.gradient, lin.e2
+    newton_decrease = np.full(S, np.inf)  # predicted by the least damped step since the last accepted one
     while running.any():
         live = np.flatnonzero(running)
         now = State(log_f[live], R[live], shared[live])
@@ -257,12 +260,21 @@ def minimise(
                 if change < tolerance and not clamped[j] and damping[k] < 1e-2:
                     running[k], converged[k], stop[k] = False, True, "converged"
                 damping[k] = max(damping[k] * 0.1, 1e-12)
+                newton_decrease[k] = np.inf
             else:
+                if usable[j] and not np.isfinite(newton_decrease[k]):
+                    newton_decrease[k] = abs(predicted[j])
+
                 if usable[j] and abs(predicted[j]) < 1e-13 * max(cost[k], 1.0) and damping[k] < 1e-2:
                     running[k], converged[k], stop[k] = False, True, "rounding"
                 damping[k] = max(damping[k], 1e-8) * 10
                 if damping[k] > 1e8:
-                    running[k], stop[k] = False, "singular" if not usable[j] else "diverged"
+                    # No step helps: either there was nothing left to gain (the Newton decrement is far below the
+                    # noise, and what stays is the rounding of cost and gradient), or the system is wrong.
+                    if newton_decrease[k] < NOTHING_TO_GAIN * cost[k]:
+                        running[k], converged[k], stop[k] = False, True, "rounding"
+                    else:
+                        running[k], stop[k] = False, "singular" if not usable[j] else "diverged"
             if running[k] and steps[k] >= max_steps:
                 running[k] = False
     return Result(

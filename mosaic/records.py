@@ -84,7 +84,7 @@ class PairFit:
 
     H_dst_src: (3, 3), raw px of src to raw px of dst, det 1 (NaN when failed): the homography nearest to the
     measured flow. overlap: share of src's informative pixels that land in dst. rms_grey: robust residual, grey
-    levels of 255. score: median residual over that of shifted pictures (0 perfect, 1 no better than chance).
+    levels of 255. score: residual scale over that of shifted pictures (0 perfect, 1 no better than chance).
     anchors_px: (4, 2) in src, info: (8, 8) px^-2 of where they land in dst (x0 y0 x1 y1 ...).
     """
 

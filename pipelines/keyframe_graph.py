@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from pipelines.bridge import CameraPose, RotationZoomFamily, homography_graph, p
 
 log = logging.getLogger(__name__)
 
-NEAREST, FARTHEST = 5, 5  # earlier keyframes that each one is paired with: the near ones hold, the far ones measure f
+NEAREST, FARTHEST = 4, 8  # earlier keyframes that each one is paired with: the near ones hold, the far ones measure f
 
 
 class KeyframeImages:
@@ -63,7 +63,7 @@ class KeyframeOptions:
 
     max_rounds: int = 8
     settled: float = 0.001
-    max_distance: float = 0.65
+    max_distance: float = 0.8
     register: RegisterOptions = field(default_factory=RegisterOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
 
@@ -113,7 +113,8 @@ def refine_keyframes(
     """
     frames = sorted(templates)
     graph = homography_graph(frames, first_fits, size_px)
-    solution = refine(graph, priors=priors, options=options.refine)
+    refine_options = replace(options.refine, reference=_best_linked(graph))
+    solution = refine(graph, priors=priors, options=refine_options)
     fits = tuple(f for f in first_fits if f.src in templates and f.dst in templates)
     rounds = 0
     for rounds in range(1, options.max_rounds + 1):
@@ -123,7 +124,9 @@ def refine_keyframes(
         new_graph = homography_graph(frames, new, size_px)
         # The first round has edges that the chain of pass one lacked: look for the optimum from scratch.
         start = solution if rounds > 1 else None
-        refined = refine(new_graph, start=start, priors=priors, options=options.refine)
+        refined = refine(
+            new_graph, start=start, priors=priors, options=replace(refine_options, reference=_best_linked(new_graph))
+        )
         if not np.isfinite(refined.log_f).any():
             break
         change = float(np.nanmean(refined.log_f) - np.nanmean(solution.log_f))
@@ -132,6 +135,18 @@ def refine_keyframes(
         if rounds > 1 and abs(change) < options.settled:
             break
     return KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=rounds)
+
+
+def _best_linked(graph: HomographyGraph) -> int:
+    """A frame of the largest connected part: a reference in a corner that hangs on nothing would lose all the rest."""
+    part = {int(f): {int(f)} for f in graph.frames}
+    for edge in graph.edges:
+        a, b = part[edge.a], part[edge.b]
+        if a is not b:
+            a |= b
+            for frame in b:
+                part[frame] = a
+    return max((int(f) for f in graph.frames), key=lambda f: (len(part[f]), -f))
 
 
 def _register_pairs(

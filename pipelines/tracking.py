@@ -18,7 +18,7 @@ from calib.refine import RefineOptions
 from calib.running import CameraEstimate, RunningCalibrator, RunningOptions
 from mosaic.coords import normalise_homography, transfer
 from mosaic.pyramid import Pyramid
-from mosaic.records import FlowGrid, PairFit
+from mosaic.records import FlowGrid, PairFit, PairStatus
 from mosaic.estimator import RegisterOptions, align
 from mosaic.rescue import match_features, phase_correlation, small_gray
 from mosaic.template import PreparedTemplate, SelectionOptions, Template, build_template, prepare
@@ -227,6 +227,20 @@ class ShotTracker:
             levels=levels,
             options=self.register_options,
         )
+        if key_fit.status != PairStatus.OK and fit.usable:
+            # The running lens may be wrong, early in a shot: eight parameters do not depend on it.
+            H = normalise_homography(fit.H_dst_src @ self._H_previous_keyframe)
+            free_fit, _ = align(
+                prepare(keyframe.template, self._free_family()),
+                pyramid,
+                H,
+                dst=frame,
+                levels=(2, 1, 0) if len(pyramid.levels) > 2 else None,
+                options=self.register_options,
+                route="eight parameters",
+            )
+            if free_fit.usable and not (key_fit.usable and key_fit.score <= free_fit.score):
+                key_fit = free_fit
         self.fits.append(key_fit)
         if fit.usable:
             # Velocity from the frame-to-frame estimate alone: keyframe corrections are no motion (real-footage.md 7.5).
