@@ -111,9 +111,6 @@ def process(
         _close(job)
         with job.timings.measure("report"):
             write_report(folder.staging, record, table, job.thumbnails)
-        scratch_folder = Path(scratch)
-        for left in scratch_folder.iterdir():
-            left.unlink()
         folder.publish(record)
     return record
 
@@ -130,7 +127,7 @@ def _first_pass(job: _Job) -> None:
     register = RegisterOptions(kernel=config.registration.kernel)
 
     def new_tracker() -> ShotTracker:
-        tracker = ShotTracker(size_px, config.registration, priors_of(config, size_px), register_options=register)
+        tracker = ShotTracker(size_px, config.registration, priors_of(config, job.clip.facts.pixel_aspect), register_options=register)
         tracker.images = KeyframeImages(job.scratch)
         job.images[id(tracker)] = tracker.images
         return tracker

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib.gates import GateOptions, judge
 from calib.level import level
 from calib.poses import solve_poses
-from calib.records import Level, Priors, Solution, Verdict
+from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
 from mosaic.composite import Panorama, composite
 from mosaic.framestore import FrameStore
@@ -99,7 +99,7 @@ def solve_shot(
     frames. mask: usable pixels, as known at the shot's end. Raises only on mistakes; bad footage is a verdict.
     """
     timings = Timings()
-    priors, refine_options = priors_of(config, tracker.size_px), refine_options_of(config)
+    priors, refine_options = tracker.priors, refine_options_of(config)
     with timings.measure("keyframes"):
         result = refine_keyframes(
             {k: key.template for k, key in tracker.keyframes.items()},
@@ -112,7 +112,8 @@ def solve_shot(
             options=KeyframeOptions(refine=refine_options, register=tracker.register_options),
         )
         result = _with_central_reference(result, priors, refine_options)
-        verdict = judge(result.solution, result.graph, GateOptions(refine=refine_options, coherent_gain=0.5))
+        result = _with_known_focal(result, tracker, config, priors, refine_options)
+        verdict = judge(result.solution, result.graph, GateOptions(refine=refine_options))
         head = level(result.solution)
     with timings.measure("poses"):
         approximate = _poses(tracker, result, tracker.fits)
@@ -154,10 +155,14 @@ def solve_shot(
     )  # fmt: skip
 
 
-def priors_of(config: Config, size_px: tuple[int, int]) -> Priors:
-    """calib's priors from what the user knows. A known focal needs a frame: see `known_focal`."""
+def priors_of(config: Config, pixel_aspect: float) -> Priors:
+    """calib's priors from what the user and the file know; a known focal comes in by `_with_known_focal`.
+
+    pixel_aspect: width over height of a pixel; K counts in stored pixels, so fx / fy is its inverse.
+    """
     o = config.calibration
     return Priors(
+        aspect=1.0 / pixel_aspect,
         c0_std=0.05 if o.distortion else 1e-6,
         pp_std_x=1e-6 if o.fix_pp else Priors().pp_std_x,
         pp_std_y=1e-6 if o.fix_pp else Priors().pp_std_y,
@@ -206,6 +211,40 @@ def _with_central_reference(result: KeyframeResult, priors: Priors, options: Ref
         return result
     refined = refine(
         result.graph, start=solution.with_reference(central), priors=priors, options=replace(options, reference=central)
+    )
+    return replace(result, solution=refined) if np.isfinite(refined.log_f).any() else result
+
+
+def _with_known_focal(
+    result: KeyframeResult, tracker: ShotTracker, config: Config, priors: Priors, options: RefineOptions
+) -> KeyframeResult:
+    """The keyframes refined again with the user's focal, when there is one and it belongs to this shot.
+
+    The focal of an ordinary frame is carried to its nearest keyframe by the measured zoom ratio (good to .1 %).
+    """
+    known = config.calibration
+    frames = [o.frame for o in tracker.observations]
+    if known.focal_px is None or not np.isfinite(result.solution.log_f).any():
+        return result
+    frame = result.solution.reference if known.focal_frame is None else known.focal_frame
+    if frame not in frames:
+        return result
+    track = _poses(tracker, result, tracker.fits)
+    row = np.flatnonzero(track.frames == frame)
+    if not len(row) or not np.isfinite(track.log_f[row[0]]):
+        return result
+    solved = result.solution.frames[np.isfinite(result.solution.log_f)]
+    keyframe = int(solved[np.argmin(np.abs(solved - frame))])
+    zoom = float(np.exp(result.solution.log_f[result.solution.index(keyframe)] - track.log_f[row[0]]))
+    std_px = known.focal_std_px or 0.02 * known.focal_px
+    with_focal = replace(
+        priors, known_focals=(KnownFocal(frame=keyframe, f_px=known.focal_px * zoom, std_px=std_px * zoom),)
+    )
+    refined = refine(
+        result.graph,
+        start=result.solution,
+        priors=with_focal,
+        options=replace(options, reference=result.solution.reference),
     )
     return replace(result, solution=refined) if np.isfinite(refined.log_f).any() else result
 

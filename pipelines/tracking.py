@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 TRUST_SIGMA = 0.3  # relative focal error at which four parameters already beat eight
+FLASH_LOG_GAIN = 0.25  # of a pair of neighbours or of a keyframe: more is a flash, or an exposure on its way
 WEAK_CHAIN = 5  # frames without a direct link to the keyframe before a new keyframe is taken
 MAX_LINKS = 6  # earlier keyframes that a new one is registered to: nearest and farthest by predicted overlap
 
@@ -146,7 +147,7 @@ class ShotTracker:
         motion = self._motion(fits)
         self._observe(frame, pts_s, "ok", "", motion, estimate)
         self._remember(frame, pyramid)
-        if self._needs_keyframe():
+        if self._needs_keyframe(fits):
             self._change_keyframe(frame, pyramid, fits)
         return True
 
@@ -285,10 +286,15 @@ class ShotTracker:
         pose = self.calibrator.pose(frame)
         return None if pose is None else CameraPose(log_f=pose[0], R=pose[1])
 
-    def _needs_keyframe(self) -> bool:
-        """Far enough from the current keyframe. The first few come sooner: a short pan must not end with one."""
+    def _needs_keyframe(self, fits: list[PairFit]) -> bool:
+        """Far enough from the current keyframe. The first few come sooner: a short pan must not end with one.
+
+        A doubtful frame (flash, blur, a crowd of players) waits for a better one, up to twice the distance.
+        """
         moved, zoom = _displacement(self._H_previous_keyframe, self.size_px)
         share = min(1.0, len(self.keyframes) / 3.0)
+        if any(f.status != PairStatus.OK or abs(np.log(f.gain)) > FLASH_LOG_GAIN for f in fits):
+            share *= 2.0
         return (
             self._n_chained >= WEAK_CHAIN
             or moved > share * self.options.keyframe_shift * self.size_px[0]
