@@ -70,13 +70,14 @@ def _linear(flat, stride, xi, yi, s, t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def sample_view(image, trust, has_trust, grid, step, gain, margin, feather, cubic, out, out_vote, out_weight):  # type: ignore[no-untyped-def]
+def sample_view(image, trust, still, grid, step, gain, margin, feather, cubic, out, out_vote, out_weight):  # type: ignore[no-untyped-def]
     """Sample one frame over one tile.
 
-    image (H, W, 3) uint8; trust (H, W) uint8, read when has_trust. grid (rows, columns, 4) float32: frame x, frame y,
+    image (H, W, 3) uint8. trust and still: uint8 planes over the same frame at any resolution, 255 = the scene at
+    rest, nearest pixel taken; a (1, 1) plane holds for the whole frame. grid (rows, columns, 4) float32: frame x, y,
     vote and weight 0..1 at every `step`-th tile pixel, linear in between. gain (3,) multiplies the channels. A sample
     nearer than `margin` px to the frame's border, or of trust or vote 0, is not seen; from there vote and weight
-    rise over `feather` px, so that no frame edge shows. Both are multiplied by trust / 255.
+    rise over `feather` px, so that no frame edge shows. Both are multiplied by trust / 255 and by still / 255.
     Out, uint8: out (3, h, w); out_vote (h, w), 0 = not seen, else at least 1; out_weight (h, w), likewise.
     Catmull-Rom (cubic) or linear, with float weights (cv2.remap rounds positions to 1/32 px).
     """
@@ -87,6 +88,8 @@ def sample_view(image, trust, has_trust, grid, step, gain, margin, feather, cubi
     gain_r, gain_g, gain_b = gain[0], gain[1], gain[2]
     zero, one, rounding, full = np.float32(0), np.float32(1), np.float32(0.5), np.float32(255)
     per = one / np.float32(step)
+    trust_x, trust_y = np.float32(trust.shape[1] / width), np.float32(trust.shape[0] / height)
+    still_x, still_y = np.float32(still.shape[1] / width), np.float32(still.shape[0] / height)
     for row in range(rows):
         i = row // step
         v = np.float32(row - i * step) * per
@@ -121,11 +124,11 @@ def sample_view(image, trust, has_trust, grid, step, gain, margin, feather, cubi
                     continue
                 ramp = min((edge + one) / feather, one)
                 xi, yi = int(x), int(y)
-                if has_trust:
-                    sure = trust[int(y + rounding), int(x + rounding)]
-                    if sure == 0:
-                        continue
-                    ramp *= np.float32(sure) / full
+                sure = trust[int((y + rounding) * trust_y), int((x + rounding) * trust_x)]
+                if sure == 0:
+                    continue
+                rest = still[int((y + rounding) * still_y), int((x + rounding) * still_x)]
+                ramp *= np.float32(sure) * np.float32(rest) * (one / (full * full))
                 s, t = x - np.float32(xi), y - np.float32(yi)
                 if cubic:
                     r, g, b = _cubic(flat, stride, xi, yi, s, t)
@@ -259,18 +262,39 @@ def _weighted_median(values, weights, n):  # type: ignore[no-untyped-def]
     return low
 
 
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _densest(stack, votes, at, n, reach):  # type: ignore[no-untyped-def]
+    """The view whose colour most votes are near: sum of votes x (1 - distance / reach). Against the median by votes:
+    .8, .7, -.1 dB where players passed (three generator clips of 120 frames with 20 % players)."""
+    best, most = 0, np.float32(-1)
+    for k in range(n):
+        if votes[k] == 0:
+            continue
+        r, g, b = np.int32(stack[k, 0, at]), np.int32(stack[k, 1, at]), np.int32(stack[k, 2, at])
+        total = np.float32(0)
+        for j in range(n):
+            d = abs(r - stack[j, 0, at]) + 2 * abs(g - stack[j, 1, at]) + abs(b - stack[j, 2, at])
+            total += votes[j] * max(reach - np.float32(d), np.float32(0))
+        if total > most:
+            best, most = k, total
+    return best
+
+
 @numba.njit(cache=True, nogil=True)
-def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, spread):  # type: ignore[no-untyped-def]
+def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, spread, support):  # type: ignore[no-untyped-def]
     """One colour a pixel from n views.
 
     stack (n, 3, N), vote (n, N), weight (n, N) uint8 as sample_view gives them; network = median_network(n).
     1. median per channel over the views that see the pixel (a missing one is padded with 0 and 255 in turn);
     2. distance d of each view to it (mean of channels, green twice), spread = 1.4826 median d;
-    3. where spread > doubt (grey levels), or where 40 % of the votes are not near the median: the median by votes
-       instead, because then it matters who votes (one moment seen many times, parallax, half-trusted views). It
-       costs 10 times the plain one, hence only there;
+    3. where spread > doubt (grey levels), or where 40 % of the votes are not near the median: instead the colour
+       that most votes are near, because then it matters who votes (one moment seen many times, parallax, half-trusted
+       views), and a ground that is always the same is denser than what passes over it. Costs 10 times the plain
+       median, hence only there;
     4. weighted mean of the views within 2 min(spread, cap) + floor of the median; the nearest view if none is.
-    One view: taken. Two: the one with more votes is the centre. Out: out (N, 3), n_seen (N,), spread (N,), uint8.
+    One view: taken. Two: the one with more votes is the centre.
+    Out, uint8: out (N, 3), n_seen (N,), spread (N,), support (N,) = 255 x share of the votes
+    that are near the median.
     """
     n, _, size = stack.shape
     rows = np.empty((n, _BLOCK), np.uint8)
@@ -278,10 +302,11 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
     apart = np.empty((n, _BLOCK), np.uint8)
     missing = np.empty(_BLOCK, np.uint8)
     median = np.empty(_BLOCK, np.uint8)
-    total = np.empty((4, _BLOCK), np.float32)
+    total = np.empty((6, _BLOCK), np.float32)
     values = np.empty(n, np.int32)
     votes = np.empty(n, np.float32)
     half = n // 2
+    reach = np.float32(4 * 20)  # distances here are sums of four
     first_pad = np.uint8(
         n % 2
     )  # odd n: the first pad goes high, even n: low, so that the rank stays the middle
@@ -341,13 +366,10 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
                 votes[k] = vote[k, at]
                 if vote[k, at] > vote[best, at]:
                     best = k
+            if count > 2:
+                best = _densest(stack, votes, at, n, reach)
             for c in range(3):
-                if count > 2:
-                    for k in range(n):
-                        values[k] = stack[k, c, at]
-                    centre[c, p] = _weighted_median(values, votes, n)
-                else:
-                    centre[c, p] = stack[best, c, at]
+                centre[c, p] = stack[best, c, at]
             for k in range(n):
                 apart[k, p] = _distance(
                     stack[k, 0, at],
@@ -373,8 +395,11 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
                 total[1, p] += w * g[p]
                 total[2, p] += w * b[p]
                 total[3, p] += w
+                total[4, p] += np.float32(seen[p]) if near else np.float32(0)
+                total[5, p] += np.float32(seen[p])
         for p in range(length):
             at = start + p
+            support[at] = np.uint8(np.float32(255) * total[4, p] / max(total[5, p], np.float32(1)))
             if total[3, p] > 0:
                 for c in range(3):
                     out[at, c] = np.uint8(total[c, p] / total[3, p] + np.float32(0.5))
@@ -398,8 +423,8 @@ def blend_stack(
     floor: float = 3.0,
     cap: float = 10.0,
     doubt: float = 6.0,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
-    """robust_value for a tile: stack (n, 3, h, w), vote and weight (n, h, w) uint8 -> image (h, w, 3), n_seen, spread.
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
+    """robust_value for a tile: stack (n, 3, h, w), vote, weight (n, h, w) -> image (h, w, 3), n_seen, spread, support.
 
     floor, cap, doubt in grey levels, see robust_value. Raises ValueError for no view or more than 255.
     """
@@ -409,8 +434,10 @@ def blend_stack(
     image: NDArray[Any] = np.empty((height * width, 3), np.uint8)
     n_seen: NDArray[Any] = np.empty(height * width, np.uint8)
     spread: NDArray[Any] = np.empty(height * width, np.uint8)
+    support: NDArray[Any] = np.empty(height * width, np.uint8)
     robust_value(
         stack.reshape(n, 3, -1), vote.reshape(n, -1), weight.reshape(n, -1), median_network(n),
-        np.float32(floor), np.float32(cap), np.float32(doubt), image, n_seen, spread,
+        np.float32(floor), np.float32(cap), np.float32(doubt), image, n_seen, spread, support,
     )  # fmt: skip
-    return image.reshape(height, width, 3), n_seen.reshape(height, width), spread.reshape(height, width)
+    plane = (height, width)
+    return image.reshape(*plane, 3), n_seen.reshape(plane), spread.reshape(plane), support.reshape(plane)

@@ -8,7 +8,9 @@ import pytest
 from mosaic.blend import blend_stack, median_network, sample_view, solve_log_gains
 
 
-def sampled(image, x, y, *, cubic=True, gain=(1, 1, 1), trust=None, margin=2.0, feather=10.0, step=16):
+def sampled(
+    image, x, y, *, cubic=True, gain=(1, 1, 1), trust=None, still=None, margin=2.0, feather=10.0, step=16
+):
     """sample_view of a map x(i), y(j) (functions of tile pixels) over a 48 x 32 tile: out, vote, weight."""
     height, width = 32, 48
     columns, rows = (step * np.arange(n // step + 1.0) for n in (width, height))
@@ -18,9 +20,10 @@ def sampled(image, x, y, *, cubic=True, gain=(1, 1, 1), trust=None, margin=2.0, 
     out, seen, weight = (
         np.zeros(s, np.uint8) for s in ((3, height, width), (height, width), (height, width))
     )
-    plane = np.zeros((1, 1), np.uint8) if trust is None else trust
+    everywhere = np.full((1, 1), 255, np.uint8)
+    trust, still = (everywhere if plane is None else plane for plane in (trust, still))
     sample_view(
-        image, plane, trust is not None, grid, step, np.array(gain, np.float32), np.float32(margin),
+        image, trust, still, grid, step, np.array(gain, np.float32), np.float32(margin),
         np.float32(feather), cubic, out, seen, weight,
     )  # fmt: skip
     return out, seen, weight
@@ -53,7 +56,7 @@ def test_a_half_pixel_shift_would_be_seen(cubic):
 def test_frame_border_is_left_out_and_feathered():
     _, seen, weight = sampled(ramp(), lambda u: u - 4.0, lambda v: 20.0 + v, margin=3.0, feather=10.0)
     assert (seen[:, :7] == 0).all() and (seen[:, 7:] > 0).all()
-    assert (weight[:, :7] == 0).all() and weight[0, 7] == 26  # a tenth of 255
+    assert (weight[:, :7] == 0).all() and weight[0, 7] in (25, 26)  # a tenth of 255
     assert (np.diff(weight[0, 7:17].astype(int)) > 0).all() and (weight[:, 17:] == 255).all()
 
 
@@ -98,7 +101,7 @@ def stack_of(n, seed=0, noise=2.0, size=(8, 300)):
 
 def test_noise_falls_as_in_a_mean_not_as_in_a_median():
     truth, stack, vote, weight = stack_of(17)
-    image, n_seen, spread = blend_stack(stack, vote, weight)
+    image, n_seen, spread, _ = blend_stack(stack, vote, weight)
     error = np.std(image - truth)
     # 2 / sqrt(17) = .49 and .29 of rounding make .56; a median would have 1.25 times the .49, so .67.
     assert error < 0.62
@@ -108,7 +111,7 @@ def test_noise_falls_as_in_a_mean_not_as_in_a_median():
 def test_outliers_in_under_half_of_the_views_leave_no_trace():
     truth, stack, vote, weight = stack_of(17)
     stack[:7] = np.array([250, 10, 10], np.uint8)[:, None, None]
-    image, _, _ = blend_stack(stack, vote, weight)
+    image, *_ = blend_stack(stack, vote, weight)
     assert np.abs(image - truth).max() < 6 and np.abs((image - truth).mean()) < 0.5
 
 
@@ -117,10 +120,10 @@ def test_views_that_do_not_see_a_pixel_do_not_count():
     stack[4:] = 0
     vote[4:] = 0
     weight[4:] = 0
-    image, n_seen, _ = blend_stack(stack, vote, weight)
+    image, n_seen, *_ = blend_stack(stack, vote, weight)
     assert (n_seen == 4).all() and np.std(image - truth) < 1.6
     vote[:] = 0
-    image, n_seen, _ = blend_stack(stack, vote, weight)
+    image, n_seen, *_ = blend_stack(stack, vote, weight)
     assert not image.any() and not n_seen.any()
 
 
@@ -130,7 +133,7 @@ def test_missing_views_do_not_shift_the_median(n, extra):
     truth, stack, vote, weight = stack_of(n + extra, noise=1.0)
     vote[n:] = 0
     stack[n:] = 255
-    image, _, _ = blend_stack(stack, vote, weight)
+    image, *_ = blend_stack(stack, vote, weight)
     # Halves are rounded up: of two views the mean is a half in every second pixel, which makes .25.
     assert abs(float((image - truth).mean())) < (0.3 if n == 2 else 0.15)
 
@@ -141,7 +144,7 @@ def test_two_views_that_differ_give_the_better_one_whole_not_a_mixture():
     stack[0], stack[1] = 40, np.array([200, 20, 90], np.uint8)[:, None, None]
     weight = np.full((2, *size), 255, np.uint8)
     vote = np.stack([np.full(size, 100, np.uint8), np.full(size, 140, np.uint8)])
-    image, _, _ = blend_stack(stack, vote, weight)
+    image, *_ = blend_stack(stack, vote, weight)
     assert (image == [200, 20, 90]).all()
 
 
@@ -149,7 +152,7 @@ def test_low_trust_in_the_many_lets_the_trusted_few_win():
     truth, stack, vote, weight = stack_of(11)
     stack[:8] = 230  # a player who stands there in most views, and is known to be one
     vote[:8] = 25
-    image, _, _ = blend_stack(stack, vote, weight)
+    image, *_ = blend_stack(stack, vote, weight)
     assert np.abs(image - truth).max() < 9
 
 
@@ -157,7 +160,7 @@ def test_where_views_disagree_the_votes_decide():
     _, stack, vote, weight = stack_of(9, noise=0.0, size=(2, 2))
     stack[:4], stack[4:] = 60, 180
     vote[:4], vote[4:] = 250, 60
-    image, _, _ = blend_stack(stack, vote, weight)
+    image, *_ = blend_stack(stack, vote, weight)
     assert (image == 60).all()
 
 

@@ -105,6 +105,28 @@ def test_a_standing_player_is_removed_where_trust_says_so(tmp_path):
     assert np.abs(trusted).mean() < 3
 
 
+def test_slow_players_are_found_by_what_sticks_out(tmp_path):
+    frames = sweep((-2, 2), n=17, f_px=400.0, size_px=(320, 180))
+    surface = choose_surface(frames, "planar")
+    pictures = []
+    for placement in frames:  # 52 px wide, 6.4 px a view: the middle is covered in 8 of 17 views
+        rgb = picture(placement)
+        at = placement.ray_to_pixel(np.array([0.016 * (placement.frame - 8), 0.0, 1.0]))
+        x, y = np.rint(at).astype(int)
+        rgb[y - 40 : y + 40, x - 26 : x + 26] = [230, 30, 30]
+        pictures.append(rgb)
+    truth = clean_plate(surface)
+    seen = np.zeros(truth.shape[:2], bool)
+    x, y = np.rint(surface.ray_to_pixel([0.0, 0.0, 1.0])).astype(int)
+    seen[y - 36 : y + 36, x - 60 : x + 60] = True
+    plain = np.abs(composite_of(tmp_path, frames, surface, pictures).image - truth).max(axis=-1)[seen] > 40
+    found = composite_of(tmp_path, frames, surface, pictures, motion_rounds=3)
+    left = np.abs(found.image - truth).max(axis=-1)[seen] > 40
+    assert plain.mean() > 0.02 and left.mean() < 0.002
+    away = (found.alpha > 0) & ~seen
+    assert psnr(found.image, truth, away) > 38
+
+
 def test_exposure_and_white_balance_are_levelled(tmp_path):
     frames = sweep((-12, 12), n=24, f_px=400.0, size_px=(240, 136))
     surface = choose_surface(frames, "cylindrical")

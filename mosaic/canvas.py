@@ -1,0 +1,38 @@
+"""Large pictures whose memory can be given back while they are not touched."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Canvas:
+    """Arrays in memory while they fit into a budget, else in an unlinked file of the scratch folder.
+
+    A shared file map counts as resident while its pages are mapped: release() unmaps them, the data stay.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], memory_bytes: int) -> None:
+        self._folder, self._left, self._maps = folder, memory_bytes, list[mmap.mmap]()
+
+    def zeros(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+        """A uint8 array of zeros."""
+        n_bytes = int(np.prod(shape))
+        if n_bytes <= self._left:
+            self._left -= n_bytes
+            return np.zeros(shape, np.uint8)
+        with tempfile.TemporaryFile(prefix="panorama-", dir=self._folder) as file:
+            file.truncate(n_bytes)
+            pages = mmap.mmap(file.fileno(), n_bytes)
+        self._maps.append(pages)
+        return np.frombuffer(pages, np.uint8).reshape(shape)
+
+    def release(self) -> None:
+        for pages in self._maps:
+            pages.flush()
+            if hasattr(mmap, "MADV_DONTNEED"):  # Linux; elsewhere the system takes pages back by itself
+                pages.madvise(mmap.MADV_DONTNEED)
