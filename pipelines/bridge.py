@@ -38,6 +38,57 @@ class PairState:
 
 
 @nb.njit(cache=True, nogil=True)
+def _source_rays(points, f, aspect, k, pp_x, pp_y, half_width):  # type: ignore[no-untyped-def]
+    """Rays (n, 3) with z = 1 of raw points (n, 2), and d ray[:2] / d point (n, 2, 2); NaN outside the model.
+
+    The compiled twin of calib.distortion.undistort (a test holds them together): eight calls of it a frame.
+    """
+    n = points.shape[0]
+    rays = np.ones((n, 3))
+    B = np.empty((n, 2, 2))
+    for i in range(n):
+        dx = points[i, 0] - pp_x
+        dy = points[i, 1] - pp_y
+        observed = np.sqrt(dx * dx + dy * dy) / half_width
+        rho = observed
+        for _ in range(8):
+            slope = 1.0 + 3.0 * k * rho * rho
+            rho -= (rho * (1.0 + k * rho * rho) - observed) / max(slope, 0.05)
+        if 1.0 + 3.0 * k * rho * rho <= 0.0 or abs(rho * (1.0 + k * rho * rho) - observed) > 1e-9 * (1.0 + observed):
+            rho = np.nan
+        ratio = rho / observed if observed > 1e-12 else 1.0
+        ux = dx * ratio
+        uy = dy * ratio
+        rays[i, 0] = ux / f
+        rays[i, 1] = uy * aspect / f
+        g = 1.0 + k * rho * rho
+        e = 2.0 * k / (half_width * half_width)
+        d00 = g + e * ux * ux
+        d01 = e * ux * uy
+        d11 = g + e * uy * uy
+        det = d00 * d11 - d01 * d01
+        B[i, 0, 0] = d11 / det / f
+        B[i, 0, 1] = -d01 / det / f
+        B[i, 1, 0] = -d01 / det * aspect / f
+        B[i, 1, 1] = d00 / det * aspect / f
+    return rays, B
+
+
+@nb.njit(cache=True, nogil=True)
+def _turned(R, turn):  # type: ignore[no-untyped-def]
+    """Exp(turn) R made orthonormal again (two Newton steps; real-footage.md 7.3)."""
+    angle2 = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
+    angle = np.sqrt(angle2)
+    sine = 1.0 - angle2 / 6.0 if angle < 1e-4 else np.sin(angle) / angle
+    cosine = 0.5 - angle2 / 24.0 if angle < 1e-4 else 2.0 * np.sin(angle / 2.0) ** 2 / angle2
+    W = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+    out = (np.eye(3) + sine * W + cosine * (W @ W)) @ R
+    for _ in range(2):
+        out = 1.5 * out - 0.5 * out @ (out.T @ out)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
 def _rotation_zoom_warp(rays, B, R, f, aspect, k, dk, pp_x, pp_y, half_width):  # type: ignore[no-untyped-def]
     """Rays (n, 3) of the source to raw target px; J (n, 2, 4) of (d log f, left rotation); A (n, 2, 2).
 
@@ -124,16 +175,15 @@ class RotationZoomFamily:
     def prepare(self, src_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rays (n, 3) with z = 1 of raw source pixels, and d ray[:2] / d raw px (n, 2, 2)."""
         lens = self.lens
-        f = np.exp(self.log_f_src)
-        ideal = lens.undistort(src_px, self.log_f_src)
-        d = ideal - lens.pp_px
-        s2 = (lens.size_px[0] / 2.0) ** 2
-        k = float(lens.k1_half(self.log_f_src))
-        g = 1.0 + k * (d**2).sum(axis=-1) / s2
-        D = g[:, None, None] * np.eye(2) + (2 * k / s2) * d[:, :, None] * d[:, None, :]
-        inverse_f = np.array([1.0 / f, lens.aspect / f])
-        rays = np.concatenate([d * inverse_f, np.ones((len(d), 1))], axis=1)
-        return np.ascontiguousarray(rays), np.ascontiguousarray(inverse_f[:, None] * np.linalg.inv(D))
+        return _source_rays(
+            np.ascontiguousarray(src_px, np.float64),
+            float(np.exp(self.log_f_src)),
+            float(lens.aspect),
+            float(lens.k1_half(self.log_f_src)),
+            float(lens.pp_px[0]),
+            float(lens.pp_px[1]),
+            lens.size_px[0] / 2.0,
+        )
 
     def warp(self, state: PairState, prepared: Any) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
         """See mosaic.warp.WarpFamily.warp."""
@@ -153,7 +203,8 @@ class RotationZoomFamily:
     def update(self, state: PairState, step: FloatArray) -> PairState:
         """Left increment of the rotation, re-orthonormalised (real-footage.md 7.3); clamped to a sane step."""
         return PairState(
-            state.log_f + float(np.clip(step[0], -0.3, 0.3)), rotation.orthonormalise(rotation.exp(step[1:]) @ state.R_dst_src)
+            state.log_f + float(min(max(step[0], -0.3), 0.3)),
+            _turned(np.ascontiguousarray(state.R_dst_src), np.ascontiguousarray(step[1:])),
         )
 
 

@@ -56,3 +56,20 @@ def test_points_behind_the_camera_are_nan():
     _, _, _, family, _ = family_and_state()
     where, _, _ = family.warp(PairState(np.log(2500.0), rotation.exp([0.0, np.pi, 0.0])), family.prepare(POINTS))
     assert np.isnan(where).all()
+
+
+@pytest.mark.parametrize("k", [0.06, 0.0, -0.1])
+def test_compiled_rays_equal_the_lens(k):
+    lens, src, _, family, _ = family_and_state(k=k)
+    rays, _ = family.prepare(POINTS)
+    f = np.exp(src.log_f)
+    ideal = rays[:, :2] * np.array([f, f / lens.aspect]) + lens.pp_px
+    np.testing.assert_allclose(ideal, lens.undistort(POINTS, src.log_f), atol=1e-7)
+
+
+def test_increment_is_a_left_rotation():
+    _, _, _, family, state = family_and_state()
+    step = np.array([0.01, 0.02, -0.03, 0.04])
+    moved = family.update(state, step)
+    np.testing.assert_allclose(moved.R_dst_src, rotation.exp(step[1:]) @ state.R_dst_src, atol=1e-12)
+    assert moved.log_f == pytest.approx(state.log_f + 0.01)
