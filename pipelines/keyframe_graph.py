@@ -51,9 +51,11 @@ class KeyframeImages:
         return build_pyramid(np.frombuffer(raw, dtype).reshape(shape), n_levels=n_levels, smooth=False, mask=mask)
 
     def close(self) -> None:
-        """Remove the file."""
-        os.close(self._file)
-        self._path.unlink(missing_ok=True)
+        """Remove the file. A second call does nothing: the descriptor's number may be another file's by then."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+            self._path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
