@@ -103,7 +103,8 @@ def summarise(
     dof = max(float(used.dof.sum()) - n_free, 1.0)
     whitened = whitened_squares(used, state)
     _, weight = loss.value_and_weight(whitened)
-    chi2_dof = float(np.nansum(weight * whitened) / dof)
+    with np.errstate(invalid="ignore"):  # a point outside the lens model has infinite misfit and no weight
+        chi2_dof = float(np.nansum(weight * whitened) / dof)
     lens_values = state.shared[0]
     lens = Lens(
         size_px=packed.size_px, pp_px=lens_values[:2], aspect=float(np.exp(lens_values[2])),

@@ -166,6 +166,8 @@ class NormalEquations:
         if self.dense is not None:
             scale = 1 / np.sqrt(np.maximum(self.diagonal[start][active], 1e-300))
             M = self.dense[start][np.ix_(active, active)] * scale[:, None] * scale[None, :]
+            if not np.isfinite(M).all():
+                raise np.linalg.LinAlgError("normal equations are not finite")
             factor = scipy.linalg.cho_factor(M, lower=True)
             inverse = scipy.linalg.cho_solve(factor, np.eye(len(M)))
             out[np.ix_(active, active)] = inverse * scale[:, None] * scale[None, :]

@@ -136,7 +136,43 @@ def refine_keyframes(
         log.debug("keyframe round %d: mean log f moved by %.5f", rounds, change)
         if rounds > 1 and abs(change) < options.settled:
             break
-    return KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=rounds)
+    result = KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=rounds)
+    lost = int((~np.isfinite(solution.log_f)).sum())
+    if lost and len(frames) > 1:
+        plain = _without_lens(templates, images, first_fits, n_levels, mask, priors, options, size_px)
+        if int((~np.isfinite(plain.solution.log_f)).sum()) < lost:
+            return plain
+    return result
+
+
+def _without_lens(
+    templates: dict[int, Template],
+    images: KeyframeImages,
+    first_fits: list[PairFit],
+    n_levels: int,
+    mask: NDArray[np.bool_] | None,
+    priors: Priors,
+    options: KeyframeOptions,
+    size_px: tuple[int, int],
+) -> KeyframeResult:
+    """All keyframes in a plain pinhole model, no edge refused: for zoom ratio and homographies where the full model
+    tears the graph apart (a wrong lens makes true edges look false). `judge` never claims a focal from it.
+    """
+    frames = sorted(templates)
+    graph = homography_graph(frames, first_fits, size_px)
+    plain = replace(
+        options.refine, distortion=False, free_pp=False, bad_edge=np.inf, reference=_best_linked(graph)
+    )
+    solution = refine(graph, priors=priors, options=plain)
+    fits = tuple(f for f in first_fits if f.src in templates and f.dst in templates)
+    if np.isfinite(solution.log_f).any():
+        new = _register_pairs(templates, images, solution, n_levels, mask, options)
+        # Pairs of the first pass hold the graph together; refined ones of the same frames replace them.
+        better = {(f.src, f.dst) for f in new if f.usable}
+        fits = (*(f for f in fits if (f.src, f.dst) not in better), *new)
+        graph = homography_graph(frames, fits, size_px)
+        solution = refine(graph, start=solution, priors=priors, options=plain)
+    return KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=1)
 
 
 def _best_linked(graph: HomographyGraph) -> int:

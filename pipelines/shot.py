@@ -38,6 +38,8 @@ from pipelines.tracking import Observation, ShotTracker
 log = logging.getLogger(__name__)
 
 MAX_PLACEMENTS_FOR_SURFACE = 400
+LEVEL_SIGMA = 0.3  # relative focal error above which the pan axis is not believed
+LEVEL_NEEDS_FOCAL = "The pan axis needs a focal length, and that is not known well enough."
 
 
 @dataclass(slots=True)
@@ -115,6 +117,9 @@ def solve_shot(
         result = _with_known_focal(result, tracker, config, priors, refine_options)
         verdict = judge(result.solution, result.graph, GateOptions(refine=refine_options))
         head = level(result.solution)
+        if not verdict.sigma_log_f_total < LEVEL_SIGMA:
+            # An axis found with a focal that is not known is as wrong as that focal.
+            head = replace(head, observable=False, reason="focal_unknown", sentence=LEVEL_NEEDS_FOCAL)
     with timings.measure("poses"):
         approximate = _poses(tracker, result, tracker.fits)
     shot_facts = [facts[o.frame] for o in tracker.observations]
