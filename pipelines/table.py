@@ -15,6 +15,9 @@ from mosaic.records import PairFit
 from pipelines.records import CameraTable
 
 WEAK_SIGMA = 0.05  # f_std_px / f_px above which a frame is 'weak' (product.md)
+# rms residual of a frame's edges beyond which its camera contradicts its pictures: px, and share of the width.
+MISFIT_PX = 2.0
+MISFIT_W = 0.004
 INTERPOLATED_INFLATION = 3.0  # error bars of a bridged frame against its neighbours'
 
 FloatArray = NDArray[np.float64]
@@ -48,7 +51,12 @@ def shot_rows(
     in the levelled head frame when `level` is observable, else in the reference camera's axes.
     """
     n = len(facts)
-    row_of = {int(f): i for i, f in enumerate(solution.frames) if np.isfinite(solution.log_f[i])}
+    width = solution.lens.size_px[0]
+    misfit = solution.rms_px > max(MISFIT_PX, MISFIT_W * width)
+    row_of = {
+        int(f): i for i, f in enumerate(solution.frames) if np.isfinite(solution.log_f[i]) and not misfit[i]
+    }
+    contradicted = {int(f) for f in solution.frames[misfit]}
     at = np.array([row_of.get(f.frame, -1) for f in facts])
     solved = at >= 0
     log_f, R, status, reason = _filled(facts, solution, at)
@@ -76,7 +84,7 @@ def shot_rows(
     for i in range(n):
         if not have[i]:
             status[i] = "lost"
-            reason[i] = reason[i] or "not_linked"
+            reason[i] = "misfit" if facts[i].frame in contradicted else reason[i] or "not_linked"
         elif status[i] == "interpolated":
             reason[i] = reason[i] or "bridged"
         elif not claims:
@@ -91,7 +99,6 @@ def shot_rows(
     pan, tilt, roll = rotation.to_pan_tilt_roll(R @ world.T)
     K_ref = solution.lens.K(log_f_ref if np.isfinite(log_f_ref) else 0.0)
     H = normalise_homography(K_ref @ np.swapaxes(R, -1, -2) @ np.linalg.inv(K))
-    width = solution.lens.size_px[0]
     focal = np.where(have & claims, f, np.nan)
     given = have & claims
 
@@ -122,7 +129,7 @@ def shot_rows(
         aspect=np.where(have, solution.lens.aspect, np.nan),
         k1=only(solution.lens.k1_opencv(np.where(have, log_f, 0.0)), given),
         residual_px=rms,
-        overlap=overlap,
+        overlap=only(overlap, have),
         homography=np.where(have[:, None, None], H, np.nan),
     )
 
