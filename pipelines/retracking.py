@@ -17,9 +17,10 @@ from mosaic.estimator import RegisterOptions, align
 from mosaic.template import PreparedTemplate, prepare
 from pipelines.bridge import CameraPose, RotationZoomFamily, pair_state
 from pipelines.config import RegistrationOptions
+from pipelines.keyframe_graph import distance_in_widths
 from pipelines.tracking import ShotTracker
 
-MAX_KEYFRAME_LINKS = 8
+LINKS = 2  # keyframes that a frame is registered to: two, so that nothing jumps where the nearest one changes
 
 
 @dataclass(slots=True, eq=False)
@@ -33,14 +34,9 @@ class Retracker:
     fits: list[PairFit] = field(default_factory=list)
     _row: dict[int, int] = field(init=False)
     _prepared: dict[int, PreparedTemplate] = field(default_factory=dict)
-    _linked: dict[int, list[int]] = field(init=False)
 
     def __post_init__(self) -> None:
         self._row = {int(f): i for i, f in enumerate(self.approximate.frames)}
-        self._linked = {}
-        for fit in self.tracker.fits:
-            if fit.usable and fit.src in self.tracker.keyframes and fit.dst in self.tracker.keyframes:
-                self._linked.setdefault(fit.dst, []).append(fit.src)
 
     def pose(self, frame: int) -> CameraPose | None:
         """The approximate camera of a frame, or None where the first pass has none."""
@@ -50,16 +46,11 @@ class Retracker:
         return CameraPose(log_f=float(self.approximate.log_f[row]), R=self.approximate.R[row])
 
     def step(self, frame: int, pyramid: Pyramid) -> list[PairFit]:
-        """Register one frame to its nearest keyframes (all linked ones when it is a keyframe). Returns the new fits."""
+        """Register one frame to its nearest keyframes. Returns the new fits."""
         pose = self.pose(frame)
-        if pose is None:
-            return []
-        near = self._nearest(frame, pose)
-        if frame in self.tracker.keyframes:
-            wanted = list(dict.fromkeys([*self._linked.get(frame, []), *near]))
-            wanted = [k for k in wanted if k < frame][:MAX_KEYFRAME_LINKS]
-        else:
-            wanted = near[:2]
+        if pose is None or frame in self.tracker.keyframes:
+            return []  # keyframes were registered to each other until they settled, and are held
+        wanted = self._nearest(frame, pose)[:LINKS]
         new = []
         for index in wanted:
             key_pose = self.pose(index)
@@ -94,11 +85,7 @@ class Retracker:
             other = self.pose(index)
             if other is None or index == frame:
                 continue
-            axis = pose.R @ other.R[2]
-            if axis[2] <= 0.1:
-                continue
-            shift = float(np.hypot(axis[0], axis[1]) / axis[2] * np.exp(pose.log_f) / width)
-            distance = shift + 2.0 * max(0.0, abs(pose.log_f - other.log_f) - 0.1)
+            distance = distance_in_widths(other, pose, width)
             if distance < 1.0 - self.options.min_overlap:
                 found.append((distance, index))
         return [index for _, index in sorted(found)]
