@@ -300,6 +300,8 @@ def judge(solution: Solution, graph: HomographyGraph, options: GateOptions | Non
 
 
 def _unusable(solution: Solution) -> str:
+    if len(solution.frames) == 1:
+        return "no_rotation"  # one keyframe did for the whole shot: a second one is taken as soon as the camera moves
     return "too_few_edges" if solution.stop == "no_edges" else "not_converged"
 
 

@@ -67,8 +67,10 @@ class OutputFolder:
         self.resume = resume
         self.staging = self.out / f"{PARTIAL}{digest}"
         self._lock: IO[bytes] | None = None
+        self._made = False
 
     def __enter__(self) -> Self:
+        self._made = not self.out.exists()
         try:
             self.out.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError):
@@ -83,6 +85,10 @@ class OutputFolder:
                 if not (self.resume and old == self.staging):
                     shutil.rmtree(old)
             self.staging.mkdir(exist_ok=True)
+            # Scratch of a run that was killed may be gigabytes, and a resume has no use for it.
+            for scratch in self.staging.glob(".*"):
+                if scratch.is_dir():
+                    shutil.rmtree(scratch)
         except OSError as error:
             self._release()
             cause = f"cannot be written ({error.strerror})"
@@ -97,6 +103,8 @@ class OutputFolder:
                 shutil.rmtree(self.staging, ignore_errors=True)
         finally:
             self._release()
+        if self._made and not any(self.out.iterdir()):
+            self.out.rmdir()  # an unusable clip leaves nothing behind
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
             raise OutputError(
                 self.out, str(error.strerror).lower(), "make room and run again with --resume"

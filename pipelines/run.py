@@ -103,12 +103,14 @@ def process(
         )
         if config.overlays.enabled:
             job.overlays = OverlayFinder(opened.facts.size_px, config.overlays)
-        _first_pass(job)
+        try:
+            _first_pass(job)
+        finally:
+            _close(job)
         table = _whole_table(job)
         folder.write_camera(table, parquet=config.output.parquet)
         job.timings.seconds["total"] = time.perf_counter() - started
         record = _record(job, opened)
-        _close(job)
         with job.timings.measure("report"):
             write_report(folder.staging, record, table, job.thumbnails)
         folder.publish(record)
@@ -181,6 +183,7 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
     assert images is not None
     if len(tracker.observations) < job.config.shots.min_frames:
         images.close()
+        job.images.pop(id(tracker), None)
         return  # its frames belong to no shot; _whole_table says so
     index = len(job.records)
     facts = {
@@ -258,7 +261,7 @@ def _record(job: _Job, clip: Clip) -> RunRecord:
 
 
 def _close(job: _Job) -> None:
-    """Let go of what unfinished trackers left open."""
+    """Let go of what trackers left open that nobody solved."""
     for images in job.images.values():
         images.close()
     job.images.clear()

@@ -84,6 +84,7 @@ class ShotSplitter:
 
     def _restarted(self, waiting: _Break, frame: int, pts_s: float, pyramid: Pyramid) -> ShotTracker:
         """The break's own tracker lost its track as well. Its frames stay unaccounted for: they belong to no shot."""
+        _drop(waiting.tracker)
         return self._started(frame, pts_s, pyramid)
 
     def _repair(self, waiting: _Break) -> None:
@@ -93,4 +94,11 @@ class ShotSplitter:
         for frame, pts_s in waiting.times:
             self._current.skip(frame, pts_s, "interpolated", "bridged")
         self._current.observations.append(repaired)
+        _drop(waiting.tracker)
         self._break = None
+
+
+def _drop(tracker: ShotTracker) -> None:
+    """Close the file of a tracker that nobody will solve: a long graphic starts one every frame."""
+    if tracker.images is not None:
+        tracker.images.close()
