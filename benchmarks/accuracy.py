@@ -25,7 +25,18 @@ from pipelines.run import process
 from tests.synth.clip import write_clip
 from tests.synth.presets import preset
 
-COLUMNS = ("preset", "seed", "status", "f med %", "f p95 %", "sigma %", "in 2s %", "zoom rms %", "corner px", "frames/s")
+COLUMNS = (
+    "preset",
+    "seed",
+    "status",
+    "f med %",
+    "f p95 %",
+    "sigma %",
+    "in 2s %",
+    "zoom rms %",
+    "corner px",
+    "frames/s",
+)
 
 
 def one(name: str, seed: int, folder: Path, changes: dict[str, Any], config: Config) -> dict[str, Any]:
@@ -76,20 +87,22 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         lines.append("")
         lines.append(
             f"{len(rows)} clips, {len(claimed)} with a focal: median error {np.median(claimed):.3f} %, 95th percentile "
-            f"{np.quantile(claimed, 0.95):.3f} %, inside two sigma {np.mean(np.array(inside) >= 50) * 100:.0f} % of clips, "
-            f"worst corner {np.nanmax([row['corner px'] for row in rows]):.2f} px"
+            f"{np.quantile(claimed, 0.95):.3f} %, inside two sigma {np.mean(np.array(inside) >= 50) * 100:.0f} % "
+            f"of clips, worst corner {np.nanmax([row['corner px'] for row in rows]):.2f} px"
         )
     return "\n".join(lines)
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--preset", nargs="+", default=["ideal", "lens"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--size", default="")
     parser.add_argument("--frames", type=int, default=0)
-    parser.add_argument("--no-panorama", action="store_true", help="calibration only: faster")
+    parser.add_argument("--megapixels", type=float, default=60.0, help="of the panorama; small = faster")
     parser.add_argument("--out", type=Path, default=None, help="keep clips and runs here")
     arguments = parser.parse_args()
     changes: dict[str, Any] = {}
@@ -97,7 +110,7 @@ def main() -> None:
         changes["width"], changes["height"] = (int(v) for v in arguments.size.split("x"))
     if arguments.frames:
         changes["n_frames"] = arguments.frames
-    config = Config.model_validate({"panorama": {"enabled": not arguments.no_panorama}})
+    config = Config.model_validate({"panorama": {"max_megapixels": arguments.megapixels}})
     with tempfile.TemporaryDirectory() as scratch:
         folder = arguments.out or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)

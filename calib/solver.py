@@ -176,6 +176,7 @@ class NormalEquations:
         out[np.ix_(order, order)] = self._bordered(0.0, np.eye(len(order)))
         return out
 
+
 NOTHING_TO_GAIN = 1e-7  # of the cost: some 1e-4 of one chi-square unit on a keyframe graph
 
 

@@ -28,11 +28,12 @@ class RegisterOptions:
     """How a pair is aligned and judged.
 
     max_steps: Gauss-Newton steps per level from the finest on. stop_sigmas: a level ends when a step is below this
-    share of its own standard deviation (Gauss-Newton's next one would be far smaller); coarse levels only hand on. min_overlap, min_inliers: shares of informative pixels.
-    score_ok, score_weak: largest residual scale against that of shifted pictures. cell_floor_px: error of a cell's
-    place that is not noise (crowd, codec; real-footage.md 6.3). cell_max_px: directions less certain are dropped.
-    cell_linear_px: residual flow beyond which it is no measurement, found in flow_passes local steps. correlation: variance inflation of a
-    cell for residuals that are correlated between its pixels.
+    share of its own standard deviation (the next one would be far smaller); stop_sigmas_coarse: of coarse levels, which
+    only hand on. min_overlap, min_inliers: shares of informative pixels. score_ok, score_weak: largest residual scale
+    against that of shifted pictures. cell_floor_px: error of a cell's place that is not noise (crowd, codec;
+    real-footage.md 6.3). cell_max_px: directions less certain are dropped. cell_linear_px: residual flow beyond which it
+    is no measurement, found in flow_passes local steps. correlation: variance inflation of a cell, whose residuals are
+    correlated between pixels. kernel: see kernels.py.
     """
 
     max_steps: tuple[int, ...] = (4, 5, 6, 8, 10, 10)
@@ -79,7 +80,7 @@ def align(
     verified PairFit and the family's state at the end. Never raises on bad pictures: the fit says what failed.
     """
     options = options or RegisterOptions()
-    template, family = source.template, source.family
+    template = source.template
     if levels is None:
         levels = [i for i in range(len(template.levels) - 1, -1, -1) if template.levels[i] is not None]
     masks = mask_arguments(target)
@@ -98,10 +99,14 @@ def align(
         if not np.isfinite(fine.scale):
             return _failed(template.frame, dst, template.size_px, "diverged", route, n_steps), start
     finest = levels[-1]
-    return _judge(source, target, finest, state, fine, gain, offset, masks, n_steps, dst, route, options), state
+    return _judge(
+        source, target, finest, state, fine, gain, offset, masks, n_steps, dst, route, options
+    ), state
 
 
-def _gain(source: PreparedTemplate, target: Pyramid, state: Any, masks: tuple[Any, ...], options: RegisterOptions) -> tuple[float, float]:
+def _gain(
+    source: PreparedTemplate, target: Pyramid, state: Any, masks: tuple[Any, ...], options: RegisterOptions
+) -> tuple[float, float]:
     kernel = kernels.load(options.kernel)
     template = source.template
     where, _, _ = source.family.warp(state, source.prepared_wide)
@@ -125,7 +130,15 @@ def _evaluate(
     assert level is not None  # the caller chose a built level
     where, J, A = source.family.warp(state, source.prepared[index])
     residual, G = kernel.linearise(
-        target.levels[index], *target.scales[index], where, A, level.values, level.gradients, gain, offset, *masks
+        target.levels[index],
+        *target.scales[index],
+        where,
+        A,
+        level.values,
+        level.gradients,
+        gain,
+        offset,
+        *masks,
     )
     valid = np.isfinite(residual)
     n_valid = int(valid.sum())
@@ -135,8 +148,8 @@ def _evaluate(
     return _Linearised(dst=where, J=J, residual=residual, G=G, scale=scale, n_valid=n_valid)
 
 
-# The scale comes from the 30 % quantile, not the median: players hold most of the strong gradients where the pitch shows
-# none, and up to two thirds of the chosen pixels may move on their own.
+# The scale comes from the 30 % quantile, not the median: players hold most of the strong gradients where the pitch
+# shows none, and up to two thirds of the chosen pixels may move on their own.
 SCALE_QUANTILE = 0.3
 NORMAL_QUANTILE = 0.38532  # of |x|, x standard normal
 
@@ -160,7 +173,8 @@ def _align_level(
     options: RegisterOptions,
 ) -> tuple[Any, int, _Linearised] | None:
     """Steps on one level; None without texture. Accepts a step only if the robust scale does not grow."""
-    if source.template.levels[index] is None or len(source.template.levels[index].src_px) < options.min_pixels:  # type: ignore[union-attr]
+    level = source.template.levels[index]
+    if level is None or len(level.src_px) < options.min_pixels:
         return None
     kernel = kernels.load(options.kernel)
     now = _evaluate(source, target, index, state, gain, offset, masks, kernel)
@@ -231,7 +245,9 @@ def _judge(
     flow = _flow_grid(source, target, index, state, fine, A, gain, offset, masks, options, kernel)
     if len(flow.cell) < 6:
         return _failed(template.frame, dst, template.size_px, "no_texture", route, n_steps, score=score)
-    H, info9 = fit_homography_to_flow(flow.src_px, flow.dst_px, flow.info, _warp_homography(level.src_px, fine.dst))
+    H, info9 = fit_homography_to_flow(
+        flow.src_px, flow.dst_px, flow.info, _warp_homography(level.src_px, fine.dst)
+    )
     anchors = default_anchors(template.size_px)
     return PairFit(
         src=template.frame,
@@ -316,7 +332,9 @@ def _flow_grid(
     scale = fine.scale
     for _ in range(options.flow_passes):
         weight = kernel.robust_weights(residual, np.float32(scale), True)
-        sums, b, S, counts = kernel.accumulate_cells(residual, G, weight, level.src_px, moved, level.cell, N_CELLS)
+        sums, b, S, counts = kernel.accumulate_cells(
+            residual, G, weight, level.src_px, moved, level.cell, N_CELLS
+        )
         values, vectors = np.linalg.eigh(sums)
         values = np.maximum(values, 1e-12)
         std2 = options.correlation * scale**2 / values
@@ -326,7 +344,15 @@ def _flow_grid(
         shift = shift + np.clip(step, -1.5, 1.5)
         moved = fine.dst + shift[level.cell]
         residual, G = kernel.linearise(
-            target.levels[index], *target.scales[index], moved, A, level.values, level.gradients, gain, offset, *masks
+            target.levels[index],
+            *target.scales[index],
+            moved,
+            A,
+            level.values,
+            level.gradients,
+            gain,
+            offset,
+            *masks,
         )
         finite = np.abs(residual[np.isfinite(residual)])
         if len(finite) < options.min_pixels:
@@ -339,8 +365,8 @@ def _flow_grid(
     if not keep.any():
         return FlowGrid.empty()
     src_px = S[keep, 1:3] / S[keep, 0:1]
-    # The warp of the centroid, not the centroid of the warped pixels: over a cell of 240 px a pan of 8 degrees bends the
-    # warp by .3 px, always to the same side (measured: 1.6 % of focal).
+    # The warp of the centroid, not the centroid of the warped pixels: over a cell of 240 px a pan of 8 degrees bends
+    # the warp by .3 px, always to the same side (measured: 1.6 % of focal).
     where, _, _ = source.family.warp(state, source.family.prepare(src_px))
     return FlowGrid(
         src_px=src_px,
@@ -352,7 +378,13 @@ def _flow_grid(
 
 
 def _failed(
-    src: int, dst: int, size_px: tuple[int, int], reason: str, route: str, n_steps: int, score: float = float("nan")
+    src: int,
+    dst: int,
+    size_px: tuple[int, int],
+    reason: str,
+    route: str,
+    n_steps: int,
+    score: float = float("nan"),
 ) -> PairFit:
     return PairFit(
         src=src,

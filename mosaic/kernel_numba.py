@@ -57,8 +57,12 @@ def select_pixels(level, bin_px, threshold, mask, mask_sx, mask_sy, use_mask):  
                 xs[count] = best_x
                 ys[count] = best_y
                 values[count] = np.float32(level[best_y, best_x])
-                gxs[count] = (np.float32(level[best_y, best_x + 1]) - np.float32(level[best_y, best_x - 1])) * np.float32(0.5)
-                gys[count] = (np.float32(level[best_y + 1, best_x]) - np.float32(level[best_y - 1, best_x])) * np.float32(0.5)
+                gxs[count] = (
+                    np.float32(level[best_y, best_x + 1]) - np.float32(level[best_y, best_x - 1])
+                ) * np.float32(0.5)
+                gys[count] = (
+                    np.float32(level[best_y + 1, best_x]) - np.float32(level[best_y - 1, best_x])
+                ) * np.float32(0.5)
                 count += 1
     return xs[:count].copy(), ys[:count].copy(), values[:count].copy(), gxs[:count].copy(), gys[:count].copy()
 
@@ -134,8 +138,12 @@ def linearise(level, sx, sy, dst, A, values, gradients, gain, offset, mask, mask
         up1 = np.float32(level[iy - 1, ix + 1])
         down0 = np.float32(level[iy + 2, ix])
         down1 = np.float32(level[iy + 2, ix + 1])
-        gx = 0.5 * (((a01 - left0) * ex + (right0 - a00) * fx) * ey + ((a11 - left1) * ex + (right1 - a10) * fx) * fy)
-        gy = 0.5 * (((a10 - up0) * ex + (a11 - up1) * fx) * ey + ((down0 - a00) * ex + (down1 - a01) * fx) * fy)
+        gx = 0.5 * (
+            ((a01 - left0) * ex + (right0 - a00) * fx) * ey + ((a11 - left1) * ex + (right1 - a10) * fx) * fy
+        )
+        gy = 0.5 * (
+            ((a10 - up0) * ex + (a11 - up1) * fx) * ey + ((down0 - a00) * ex + (down1 - a01) * fx) * fy
+        )
         det = A[i, 0, 0] * A[i, 1, 1] - A[i, 0, 1] * A[i, 1, 0]
         if abs(det) < 1e-12:
             residual[i] = np.nan

@@ -101,7 +101,9 @@ def accumulate(
     """See kernel_numba.accumulate: N (p, p), b (p,), cost."""
     w = torch.from_numpy(weight.astype(np.float64))
     r = torch.nan_to_num(torch.from_numpy(residual.astype(np.float64)))
-    rows = torch.einsum("nk,nkp->np", torch.from_numpy(G.astype(np.float64)), torch.from_numpy(J.astype(np.float64)))
+    rows = torch.einsum(
+        "nk,nkp->np", torch.from_numpy(G.astype(np.float64)), torch.from_numpy(J.astype(np.float64))
+    )
     rows = torch.nan_to_num(rows)
     weighted = rows * w[:, None]
     return (rows.T @ weighted).numpy(), (weighted.T @ r).numpy(), float((w * r * r).sum())

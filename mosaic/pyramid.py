@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -37,7 +38,11 @@ def n_levels_for(size_px: tuple[int, int], coarsest_px: int = 120) -> int:
 
 
 def build_pyramid(
-    gray: NDArray[np.generic], *, n_levels: int | None = None, smooth: bool = True, mask: NDArray[np.bool_] | None = None
+    gray: NDArray[np.generic],
+    *,
+    n_levels: int | None = None,
+    smooth: bool = True,
+    mask: NDArray[np.bool_] | None = None,
 ) -> Pyramid:
     """Pyramid of a gray picture (h, w), uint8 or float32 with values 0..255.
 
@@ -51,8 +56,8 @@ def build_pyramid(
         raise ValueError(f"uint8 or float32 expected, got {gray.dtype}")
     size_px = (gray.shape[1], gray.shape[0])
     count = n_levels_for(size_px) if n_levels is None else n_levels
-    first = cv2.GaussianBlur(gray, (3, 3), 0) if smooth else np.ascontiguousarray(gray)
-    levels: list[NDArray[np.generic]] = [first]
+    first: Any = cv2.GaussianBlur(cast(Any, gray), (3, 3), 0) if smooth else np.ascontiguousarray(gray)
+    levels: list[Any] = [first]
     for _ in range(count - 1):
         h, w = levels[-1].shape
         levels.append(cv2.resize(levels[-1], ((w + 1) // 2, (h + 1) // 2), interpolation=cv2.INTER_AREA))
@@ -63,5 +68,7 @@ def build_pyramid(
             raise ValueError(f"mask {mask.shape} does not match the picture {gray.shape}")
         h, w = (gray.shape[0] + 3) // 4, (gray.shape[1] + 3) // 4
         # A quarter pixel is usable only when all of it is.
-        small = (cv2.resize(mask.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.999).astype(np.uint8)
+        small = (cv2.resize(mask.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.999).astype(
+            np.uint8
+        )
     return Pyramid(levels=tuple(levels), scales=scales, size_px=size_px, mask=small)

@@ -63,7 +63,9 @@ class FlowGrid:
     def __post_init__(self) -> None:
         m = len(self.cell)
         if self.src_px.shape != (m, 2) or self.dst_px.shape != (m, 2) or self.info.shape != (m, 2, 2):
-            raise ValueError(f"{m} cells do not match {self.src_px.shape}, {self.dst_px.shape}, {self.info.shape}")
+            raise ValueError(
+                f"{m} cells do not match {self.src_px.shape}, {self.dst_px.shape}, {self.info.shape}"
+            )
         freeze_arrays(self)
 
     @classmethod

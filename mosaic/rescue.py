@@ -1,4 +1,4 @@
-"""Coarse starts for a lost pair: phase correlation, then features. They start the direct estimator, never replace it."""
+"""Coarse starts for a lost pair: phase correlation, then features. They start the direct estimator, no more."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ def _level_to_full(size_px: tuple[int, int], small: NDArray[np.uint8]) -> FloatA
     return np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
 
 
-def phase_correlation(src: NDArray[np.uint8], dst: NDArray[np.uint8], size_px: tuple[int, int]) -> tuple[FloatArray, float]:
+def phase_correlation(
+    src: NDArray[np.uint8], dst: NDArray[np.uint8], size_px: tuple[int, int]
+) -> tuple[FloatArray, float]:
     """Translation between two small pictures of equal size as H_dst_src (full px) with the peak's response 0..1."""
     h, w = src.shape
     a = cv2.resize(src, (min(w, 256), min(h, 144)), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -41,7 +43,7 @@ def match_features(
     src: NDArray[np.uint8], dst: NDArray[np.uint8], size_px: tuple[int, int], *, min_matches: int = 24
 ) -> FloatArray | None:
     """H_dst_src (full px, det 1) from SIFT and MAGSAC between two small pictures, or None when nothing convinces."""
-    sift = cv2.SIFT_create(nfeatures=1500)
+    sift = cv2.SIFT.create(nfeatures=1500)
     key_a, desc_a = sift.detectAndCompute(src, None)
     key_b, desc_b = sift.detectAndCompute(dst, None)
     if desc_a is None or desc_b is None or len(key_a) < min_matches or len(key_b) < min_matches:

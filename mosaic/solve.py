@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 
@@ -9,7 +11,7 @@ from mosaic.records import FloatArray
 
 
 @nb.njit(cache=True, nogil=True)
-def _scaled_solve(N, b, damping):  # type: ignore[no-untyped-def]
+def _scaled_solve(N: Any, b: Any, damping: float) -> Any:
     """Cholesky solution after scaling the diagonal to one, and whether it went well."""
     p = len(b)
     s = np.empty(p)
@@ -55,4 +57,5 @@ def newton_step(N: FloatArray, b: FloatArray, damping: float) -> FloatArray | No
 
 def step_in_sigmas(N: FloatArray, step: FloatArray, variance: float) -> float:
     """Length of a step against its own standard deviation: sqrt(d^T N d / (p variance)). No unit."""
-    return float(np.sqrt(max(step @ N @ step, 0.0) / (len(step) * max(variance, 1e-12))))
+    decrease = float(step @ N @ step)
+    return float(np.sqrt(max(decrease, 0.0) / (len(step) * max(variance, 1e-12))))

@@ -97,7 +97,13 @@ def build_template(
         n = options.n_per_level[min(index, len(options.n_per_level) - 1)]
         bin_px = max(2, round((w * h / n) ** 0.5))
         x, y, values, gx, gy = kernel.select_pixels(
-            level, bin_px, np.float32(options.threshold_grey), mask, scale[0] / mask_sx, scale[1] / mask_sy, use_mask
+            level,
+            bin_px,
+            np.float32(options.threshold_grey),
+            mask,
+            scale[0] / mask_sx,
+            scale[1] / mask_sy,
+            use_mask,
         )
         src = to_full(np.stack([x, y], axis=1).astype(np.float64), scale)
         built[index] = TemplateLevel(

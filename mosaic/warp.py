@@ -18,7 +18,10 @@ from mosaic.records import FloatArray
 class WarpFamily(Protocol):
     """A family of maps src -> dst in raw full-size pixels, with a state that the estimator only passes on."""
 
-    n_parameters: int
+    @property
+    def n_parameters(self) -> int:
+        """Number of increments p."""
+        ...
 
     def prepare(self, src_px: FloatArray) -> Any:
         """What can be computed once for fixed source points (n, 2)."""
@@ -49,7 +52,9 @@ class HomographyFamily:
         """Source points as they are."""
         return np.ascontiguousarray(src_px, np.float64)
 
-    def warp(self, state: FloatArray, prepared: FloatArray) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
+    def warp(
+        self, state: FloatArray, prepared: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
         """See WarpFamily.warp."""
         from mosaic.kernel_numba import homography_warp
 

@@ -14,8 +14,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.records import HomographyEdge, HomographyGraph, Lens
 from calib import rotation
+from calib.records import HomographyEdge, HomographyGraph, Lens
 from mosaic.records import PairFit
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +54,9 @@ def _source_rays(points, f, aspect, k, pp_x, pp_y, half_width):  # type: ignore[
         for _ in range(8):
             slope = 1.0 + 3.0 * k * rho * rho
             rho -= (rho * (1.0 + k * rho * rho) - observed) / max(slope, 0.05)
-        if 1.0 + 3.0 * k * rho * rho <= 0.0 or abs(rho * (1.0 + k * rho * rho) - observed) > 1e-9 * (1.0 + observed):
+        if 1.0 + 3.0 * k * rho * rho <= 0.0 or abs(rho * (1.0 + k * rho * rho) - observed) > 1e-9 * (
+            1.0 + observed
+        ):
             rho = np.nan
         ratio = rho / observed if observed > 1e-12 else 1.0
         ux = dx * ratio
@@ -89,7 +91,18 @@ def _turned(R, turn):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _rotation_zoom_warp(rays, B, R, f, aspect, k, dk, pp_x, pp_y, half_width):  # type: ignore[no-untyped-def]
+def _rotation_zoom_warp(
+    rays: Any,
+    B: Any,
+    R: Any,
+    f: float,
+    aspect: float,
+    k: float,
+    dk: float,
+    pp_x: float,
+    pp_y: float,
+    half_width: float,
+) -> Any:
     """Rays (n, 3) of the source to raw target px; J (n, 2, 4) of (d log f, left rotation); A (n, 2, 2).
 
     B (n, 2, 2) = d ray[:2] / d raw source px. calibration.md 6.3 with the source camera held.
@@ -188,8 +201,10 @@ class RotationZoomFamily:
     def warp(self, state: PairState, prepared: Any) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
         """See mosaic.warp.WarpFamily.warp."""
         lens = self.lens
+        rays, B = prepared
         return _rotation_zoom_warp(
-            *prepared,
+            rays,
+            B,
             np.ascontiguousarray(state.R_dst_src),
             float(np.exp(state.log_f)),
             float(lens.aspect),

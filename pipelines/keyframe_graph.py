@@ -25,7 +25,10 @@ from pipelines.bridge import CameraPose, RotationZoomFamily, homography_graph, p
 
 log = logging.getLogger(__name__)
 
-NEAREST, FARTHEST = 4, 8  # earlier keyframes that each one is paired with: the near ones hold, the far ones measure f
+NEAREST, FARTHEST = (
+    4,
+    8,
+)  # earlier keyframes that each one is paired with: the near ones hold, the far ones measure f
 
 
 class KeyframeImages:
@@ -48,7 +51,9 @@ class KeyframeImages:
         """The pyramid of a kept frame, under a mask that may be newer than the frame."""
         offset, shape, dtype = self._where[frame]
         raw = os.pread(self._file, int(np.prod(shape)) * dtype.itemsize, offset)
-        return build_pyramid(np.frombuffer(raw, dtype).reshape(shape), n_levels=n_levels, smooth=False, mask=mask)
+        return build_pyramid(
+            np.frombuffer(raw, dtype).reshape(shape), n_levels=n_levels, smooth=False, mask=mask
+        )
 
     def close(self) -> None:
         """Remove the file. A second call does nothing: the descriptor's number may be another file's by then."""
@@ -127,7 +132,10 @@ def refine_keyframes(
         # The first round has edges that the chain of pass one lacked: look for the optimum from scratch.
         start = solution if rounds > 1 else None
         refined = refine(
-            new_graph, start=start, priors=priors, options=replace(refine_options, reference=_best_linked(new_graph))
+            new_graph,
+            start=start,
+            priors=priors,
+            options=replace(refine_options, reference=_best_linked(new_graph)),
         )
         if not np.isfinite(refined.log_f).any():
             break

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.records import Solution
+from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid
 from mosaic.records import PairFit
-from mosaic.estimator import RegisterOptions, align
 from mosaic.template import PreparedTemplate, prepare
 from pipelines.bridge import CameraPose, RotationZoomFamily, pair_state
 from pipelines.config import RegistrationOptions

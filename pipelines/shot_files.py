@@ -50,7 +50,11 @@ def write_shot(
             "median_relative_std": float(np.median(rows.f_std_px[claimed] / rows.f_px[claimed])),
         }
     if not solved.any():
-        status, reason, sentence = "failed", "not_linked", "No frame of the shot could be registered to another."
+        status, reason, sentence = (
+            "failed",
+            "not_linked",
+            "No frame of the shot could be registered to another.",
+        )
     elif focal is None:
         status, reason, sentence = "relative", shot.verdict.reason, shot.verdict.sentence
     else:
@@ -95,7 +99,9 @@ def pair_arrays(shot: CalibratedShot) -> dict[str, Any]:
         "flow_cell": np.concatenate([f.flow.cell for f in fits]) if fits else np.zeros(0, np.int64),
         "flow_src_px": np.concatenate([f.flow.src_px for f in fits]) if fits else np.zeros((0, 2)),
         "flow_dst_px": np.concatenate([f.flow.dst_px for f in fits]) if fits else np.zeros((0, 2)),
-        "flow_info": np.concatenate([f.flow.info for f in fits]).astype(np.float32) if fits else np.zeros((0, 2, 2)),
+        "flow_info": np.concatenate([f.flow.info for f in fits]).astype(np.float32)
+        if fits
+        else np.zeros((0, 2, 2)),
         "size_px": np.array(shot.graph.size_px, np.int64),
     }
 
@@ -111,7 +117,11 @@ def panorama_facts(panorama: Panorama) -> dict[str, Any]:
         w, h = placement.size_px
         corners = np.array([[0, 0], [w - 1, 0], [w - 1, h - 1], [0, h - 1]], float)
         border = np.concatenate(
-            [corners[i] + np.linspace(0, 1, 6, endpoint=False)[:, None] * (corners[(i + 1) % 4] - corners[i]) for i in range(4)]
+            [
+                corners[i]
+                + np.linspace(0, 1, 6, endpoint=False)[:, None] * (corners[(i + 1) % 4] - corners[i])
+                for i in range(4)
+            ]
         )
         pixels = panorama.frame_to_pixel(frame, border)
         if np.isfinite(pixels).all():
@@ -133,7 +143,9 @@ def thumbnail(tracker: ShotTracker) -> bytes | None:
     keys = sorted(tracker.keyframes)
     small = tracker.keyframes[keys[len(keys) // 2]].small
     width = 240
-    picture = cv2.resize(small, (width, max(1, round(small.shape[0] * width / small.shape[1]))), interpolation=cv2.INTER_AREA)
+    picture = cv2.resize(
+        small, (width, max(1, round(small.shape[0] * width / small.shape[1]))), interpolation=cv2.INTER_AREA
+    )
     good, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
     return data.tobytes() if good else None
 

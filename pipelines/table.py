@@ -1,4 +1,4 @@
-"""The rows of camera.csv for a shot: from a solved track and its verdict to values, error bars, statuses and reasons."""
+"""The rows of camera.csv for a shot: from a solved track and its verdict to values, error bars, statuses."""
 
 from __future__ import annotations
 
@@ -144,12 +144,12 @@ def _filled(
     status = ["ok"] * n
     reason = [""] * n
     known = np.flatnonzero(at >= 0)
-    for i in np.flatnonzero(at < 0):
+    for i in np.flatnonzero(at < 0).tolist():
         status[i], reason[i] = "lost", facts[i].reason or "not_linked"
         before, after = known[known < i], known[known > i]
         if len(before) == 0 or len(after) == 0:
             continue
-        a, b = before[-1], after[0]
+        a, b = int(before[-1]), int(after[0])
         if b - a > 12:
             continue
         t = (facts[i].pts_s - facts[a].pts_s) / max(facts[b].pts_s - facts[a].pts_s, 1e-9)

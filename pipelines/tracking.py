@@ -17,9 +17,9 @@ from calib.records import Lens, Priors
 from calib.refine import RefineOptions
 from calib.running import CameraEstimate, RunningCalibrator, RunningOptions
 from mosaic.coords import normalise_homography, transfer
+from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid
 from mosaic.records import FlowGrid, PairFit, PairStatus
-from mosaic.estimator import RegisterOptions, align
 from mosaic.rescue import match_features, phase_correlation, small_gray
 from mosaic.template import PreparedTemplate, SelectionOptions, Template, build_template, prepare
 from mosaic.warp import HomographyFamily
@@ -39,7 +39,11 @@ MAX_LINKS = 6  # earlier keyframes that a new one is registered to: nearest and 
 RUNNING = RunningOptions(
     cold_at=(3, 6),
     refine=RefineOptions(
-        k1_trials=(-0.02, 0.01, 0.04), focal_trials_w=(1.0, 2.0, 3.5), focal_k1=(0.0,), tolerance=1e-6, max_steps=60
+        k1_trials=(-0.02, 0.01, 0.04),
+        focal_trials_w=(1.0, 2.0, 3.5),
+        focal_k1=(0.0,),
+        tolerance=1e-6,
+        max_steps=60,
     ),
 )
 
@@ -99,7 +103,9 @@ class ShotTracker:
     _velocity: tuple[float, FloatArray] = field(default_factory=lambda: (0.0, np.eye(3)))
     _changes: deque[float] = field(default_factory=lambda: deque(maxlen=25))
     _n_chained: int = 0
-    _chain: PairFit | None = None  # current keyframe to the previous frame, composed while no direct link held
+    _chain: PairFit | None = (
+        None  # current keyframe to the previous frame, composed while no direct link held
+    )
 
     def __post_init__(self) -> None:
         self.calibrator = RunningCalibrator(self.size_px, priors=self.priors, options=RUNNING)
@@ -136,7 +142,11 @@ class ShotTracker:
             self._observe(frame, pts_s, last.status, "duplicate", 0.0, last.estimate)
             return True
         before = len(self.fits)
-        linked = self._step_calibrated(frame, pyramid) if self.trusts_camera and self._pose is not None else self._step_free(frame, pyramid)
+        linked = (
+            self._step_calibrated(frame, pyramid)
+            if self.trusts_camera and self._pose is not None
+            else self._step_free(frame, pyramid)
+        )
         if not linked and rescue:
             linked = self._rescue(frame, pyramid)
         if not linked:
@@ -167,7 +177,12 @@ class ShotTracker:
         step = self._H_step
         assert self._previous is not None
         fit, H_prev = align(
-            prepare(self._previous, family), pyramid, step, dst=frame, levels=coarse, options=self.register_options
+            prepare(self._previous, family),
+            pyramid,
+            step,
+            dst=frame,
+            levels=coarse,
+            options=self.register_options,
         )
         if not fit.usable and not np.array_equal(step, np.eye(3)):
             fit, H_prev = align(
@@ -181,7 +196,12 @@ class ShotTracker:
         else:
             levels = (1, 0) if fit.usable else tuple(range(len(pyramid.levels) - 1, -1, -1))
         key_fit, H_key = align(
-            prepare(keyframe.template, family), pyramid, start, dst=frame, levels=levels, options=self.register_options
+            prepare(keyframe.template, family),
+            pyramid,
+            start,
+            dst=frame,
+            levels=levels,
+            options=self.register_options,
         )
         if keyframe.frame == self._previous_frame and key_fit.usable:
             self.fits[-1] = key_fit  # one edge, the finer one
@@ -207,7 +227,12 @@ class ShotTracker:
         source = prepare(self._previous, family)
         coarse = self._coarse_levels(pyramid)
         fit, state = align(
-            source, pyramid, pair_state(self._pose, predicted), dst=frame, levels=coarse, options=self.register_options
+            source,
+            pyramid,
+            pair_state(self._pose, predicted),
+            dst=frame,
+            levels=coarse,
+            options=self.register_options,
         )
         if not fit.usable:
             fit, state = align(
@@ -256,7 +281,11 @@ class ShotTracker:
         family = self._free_family()
         keyframe = self.keyframes[self._current]
         candidates = [(keyframe.template, keyframe.small, True)]
-        if self._previous is not None and self._previous_small is not None and self._previous_frame != keyframe.frame:
+        if (
+            self._previous is not None
+            and self._previous_small is not None
+            and self._previous_frame != keyframe.frame
+        ):
             candidates.insert(0, (self._previous, self._previous_small, False))
         for route in ("phase correlation", "features"):
             for template, source_small, is_keyframe in candidates:
@@ -266,9 +295,17 @@ class ShotTracker:
                         continue
                 else:
                     H, _ = phase_correlation(source_small, small, self.size_px)
-                levels = [i for i in range(len(template.levels) - 1, -1, -1) if template.levels[i] is not None]
+                levels = [
+                    i for i in range(len(template.levels) - 1, -1, -1) if template.levels[i] is not None
+                ]
                 fit, state = align(
-                    prepare(template, family), pyramid, H, dst=frame, levels=levels, options=self.register_options, route=route
+                    prepare(template, family),
+                    pyramid,
+                    H,
+                    dst=frame,
+                    levels=levels,
+                    options=self.register_options,
+                    route=route,
                 )
                 if fit.usable:
                     self.fits.append(fit)
@@ -317,8 +354,16 @@ class ShotTracker:
                     return
         links = [f for f in fits if f.src in self.keyframes]
         if self.trusts_camera and self._pose is not None:
-            near = [(d, i) for d, i in self._neighbours(self._pose) if d < 1 - self.options.min_overlap and i != self._current]
-            chosen = near if len(near) <= MAX_LINKS else near[: MAX_LINKS // 2] + near[-(MAX_LINKS - MAX_LINKS // 2) :]
+            near = [
+                (d, i)
+                for d, i in self._neighbours(self._pose)
+                if d < 1 - self.options.min_overlap and i != self._current
+            ]
+            chosen = (
+                near
+                if len(near) <= MAX_LINKS
+                else near[: MAX_LINKS // 2] + near[-(MAX_LINKS - MAX_LINKS // 2) :]
+            )
             for _, index in chosen:
                 fit = self._link(index, self._pose, frame, pyramid)
                 self.fits.append(fit)
@@ -410,7 +455,13 @@ class ShotTracker:
         return _displacement(self._H_step, self.size_px)[0]
 
     def _observe(
-        self, frame: int, pts_s: float, status: str, reason: str, motion_px: float, estimate: CameraEstimate | None
+        self,
+        frame: int,
+        pts_s: float,
+        status: str,
+        reason: str,
+        motion_px: float,
+        estimate: CameraEstimate | None,
     ) -> None:
         self.observations.append(
             Observation(

@@ -54,7 +54,9 @@ def test_source_derivative_against_central_differences():
 
 def test_points_behind_the_camera_are_nan():
     _, _, _, family, _ = family_and_state()
-    where, _, _ = family.warp(PairState(np.log(2500.0), rotation.exp([0.0, np.pi, 0.0])), family.prepare(POINTS))
+    where, _, _ = family.warp(
+        PairState(np.log(2500.0), rotation.exp([0.0, np.pi, 0.0])), family.prepare(POINTS)
+    )
     assert np.isnan(where).all()
 
 
