@@ -40,7 +40,7 @@ class _Bwdif:
         graph = av.filter.Graph()
         unit = Fraction(1, 1000)
         source = graph.add_buffer(
-            width=like.width, height=like.height, format=like.format.name, time_base=unit
+            width=like.width, height=like.height, format=like.format, time_base=unit
         )
         bwdif = graph.add("bwdif", f"mode=send_{mode}:parity=auto:deint=interlaced")
         sink = graph.add("buffersink")
@@ -67,6 +67,8 @@ class _Bwdif:
             except (av.error.BlockingIOError, av.error.EOFError):
                 return
             # bwdif counts time in half units of its input's.
+            if out.pts is None or out.time_base is None:  # bwdif always sets them; the types do not say so
+                continue
             halves = round(out.pts * out.time_base / self._unit * 2)
             number, half = divmod(halves, 2)
             source = self._waiting[number]

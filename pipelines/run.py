@@ -40,6 +40,7 @@ from pipelines.tracking import ShotTracker
 log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int | None], None]
+MASK_EVERY = 25  # frames between two looks for fixed graphics: a look costs as much as registering two frames
 PACKAGES = ("av", "kornia", "numba", "numpy", "opencv-contrib-python-headless", "scipy", "tifffile", "torch")
 
 
@@ -153,7 +154,7 @@ def _first_pass(job: _Job) -> None:
                 motion = splitter.last_motion_px
                 if np.isfinite(motion):
                     job.overlays.update(frame.gray, motion)
-                if count % 10 == 0:
+                if count % MASK_EVERY == 0:
                     job.mask = job.overlays.mask()
         for shot in done:
             _finish(job, shot)
