@@ -1,0 +1,201 @@
+"""Two pictures, one homography: `register`, for whoever has no clip and no camera, only two images.
+
+The direct estimator over all levels from a start or from identity; where that fails, again from phase correlation, then
+from features. Whatever the start, the result is the direct estimator's and has to pass its score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mosaic.coords import normalise_homography, transfer
+from mosaic.estimator import RegisterOptions, align
+from mosaic.gray import as_gray, as_mask, as_planes, white_of
+from mosaic.kernels import KernelName
+from mosaic.pyramid import Pyramid, build_pyramid, n_levels_for
+from mosaic.records import PAIR_REASONS, FloatArray, PairFit, PairStatus
+from mosaic.rescue import match_features, phase_correlation, small_gray
+from mosaic.template import PreparedTemplate, SelectionOptions, build_template, prepare
+from mosaic.warp import HomographyFamily
+
+REASONS = {**PAIR_REASONS, "asymmetric": "the pictures the other way round give another homography"}
+
+# Failures that say nothing about the pair: a picture that sees five times more cannot be the template of the other.
+_NO_VERDICT = ("low_overlap", "no_texture")
+
+_RANK = {PairStatus.OK: 0, PairStatus.WEAK: 1, PairStatus.FAILED: 2, PairStatus.SKIPPED: 3}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairOptions:
+    """How two pictures are registered.
+
+    selection, estimator: which pixels, and how they are aligned and judged. rescue: try phase correlation and features
+    where the direct start fails. smooth: the 3x3 blur that unbiased sampling wants; off for pictures that are soft
+    already. symmetric_px: how far from where it began the way from a to b and back may end, rms over the measured
+    cells, px of a, before the pair is weak and another start is tried; None: not checked. The score alone passes pairs
+    in which most of the strong gradients belong to things that move by themselves (measured: 6 px off at a score of
+    .58; back from b it shows, and a start from features gets such a pair to .6 px).
+    """
+
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    estimator: RegisterOptions = field(default_factory=RegisterOptions)
+    rescue: bool = True
+    smooth: bool = True
+    symmetric_px: float | None = 1.0
+
+
+def register(
+    a: Any,
+    b: Any,
+    *,
+    mask_a: Any = None,
+    mask_b: Any = None,
+    start: ArrayLike | None = None,
+    kernel: KernelName | None = None,
+    white: float | None = None,
+    options: PairOptions | None = None,
+) -> PairFit:
+    """Homography from picture a to picture b (8 parameters), verified; a failure is a status with a reason.
+
+    a, b: numpy (h, w) or RGB (h, w, 3), or torch (H, W), (C, H, W), (1, C, H, W); uint8, uint16 or float. They may
+    differ in size. white: the value of white; default by type, floats 1 or 255 (gray.white_of). mask_a, mask_b:
+    (h, w), True = usable. start: H_b_a (3, 3) to begin with, raw px; default the map that lays one frame over the
+    other. kernel: 'numba' (default) or 'torch', the readable reference: equal within 1e-3 px, slower.
+
+    Returns PairFit with src = 0 (a), dst = 1 (b): H_dst_src maps px of a into b, det 1, NaN when failed. reason: a
+    code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation' or 'features';
+    n_steps counts all that were tried.
+    Raises ValueError or TypeError for pictures, masks or a start of the wrong shape, type or value.
+    """
+    options = options or PairOptions()
+    if kernel is not None:
+        options = replace(options, estimator=replace(options.estimator, kernel=kernel))
+    planes = as_planes(a), as_planes(b)
+    value = white_of(*planes) if white is None else float(white)
+    if not value > 0:
+        raise ValueError(f"white must be positive, got {value}")
+    gray = as_gray(planes[0], value), as_gray(planes[1], value)
+    n_levels = min(n_levels_for((p.shape[1], p.shape[0])) for p in gray)
+    source, target = (
+        build_pyramid(g, n_levels=n_levels, smooth=options.smooth, mask=as_mask(m, (g.shape[1], g.shape[0])))
+        for g, m in zip(gray, (mask_a, mask_b), strict=True)
+    )
+    return register_pyramids(source, target, start=_checked(start), options=options)
+
+
+def register_pyramids(
+    source: Pyramid, target: Pyramid, *, start: FloatArray | None = None, options: PairOptions | None = None
+) -> PairFit:
+    """`register` for pyramids of equally many levels."""
+    options = options or PairOptions()
+    template = build_template(source, 0, options=options.selection)
+    # The increments act in the picture that they move points in.
+    prepared = prepare(template, HomographyFamily(size_px=target.size_px))
+    enough = options.estimator.min_pixels
+    # A coarse level too poor to align on is passed over; on the finest level the estimator itself says no_texture.
+    levels = [i for i in range(len(template.levels) - 1, 0, -1) if _n_pixels(prepared, i) >= enough] + [0]
+    best: PairFit | None = None
+    reverse: PreparedTemplate | None = None
+    n_steps = 0
+    for route, H in _starts(source, target, start, options.rescue):
+        fit, _ = align(prepared, target, H, dst=1, levels=levels, options=options.estimator, route=route)
+        n_steps += fit.n_steps
+        if fit.usable and options.symmetric_px is not None:
+            if reverse is None:
+                reverse = prepare(
+                    build_template(target, 1, options=options.selection),
+                    HomographyFamily(size_px=source.size_px),
+                )
+            fit, steps = _both_ways(fit, reverse, source, options)
+            n_steps += steps
+        if best is None or _order(fit) < _order(best):
+            best = fit
+        if fit.status == PairStatus.OK or (fit.reason == "no_texture" and _n_pixels(prepared, 0) < enough):
+            break
+    assert best is not None  # identity is always tried
+    return replace(best, n_steps=n_steps)
+
+
+def _both_ways(
+    fit: PairFit, reverse: PreparedTemplate, source: Pyramid, options: PairOptions
+) -> tuple[PairFit, int]:
+    """The fit, weak if b to a, started from its inverse, does not lead back; and the steps that took."""
+    levels = [i for i in (1, 0) if _n_pixels(reverse, i) >= options.estimator.min_pixels]
+    if not levels:
+        return fit, 0
+    back, _ = align(
+        reverse, source, normalise_homography(np.linalg.inv(fit.H_dst_src)), dst=0, levels=levels,
+        options=options.estimator,
+    )  # fmt: skip
+    if back.reason in _NO_VERDICT:
+        return fit, back.n_steps
+    away = transfer(back.H_dst_src, transfer(fit.H_dst_src, fit.flow.src_px)) - fit.flow.src_px
+    if back.usable and np.sqrt(np.mean(np.sum(away**2, axis=1))) <= options.symmetric_px:
+        return fit, back.n_steps
+    return replace(fit, status=PairStatus.WEAK, reason="asymmetric"), back.n_steps
+
+
+def _order(fit: PairFit) -> tuple[int, float]:
+    """The better of two fits comes first: by status, then by score (unknown last)."""
+    return _RANK[fit.status], fit.score if np.isfinite(fit.score) else np.inf
+
+
+def _n_pixels(prepared: PreparedTemplate, index: int) -> int:
+    level = prepared.template.levels[index]
+    return 0 if level is None else len(level.src_px)
+
+
+def _checked(start: ArrayLike | None) -> FloatArray | None:
+    if start is None:
+        return None
+    H = np.asarray(start, np.float64)
+    if H.shape != (3, 3):
+        raise ValueError(f"start must be a homography (3, 3), got {H.shape}")
+    H = normalise_homography(H)
+    if not np.isfinite(H).all():
+        raise ValueError("start must be finite and regular")
+    return H
+
+
+def _starts(
+    source: Pyramid, target: Pyramid, start: FloatArray | None, rescue: bool
+) -> Iterator[tuple[str, FloatArray]]:
+    """Routes and their starts H_b_a, the cheap ones first; a later one is only made when it is asked for."""
+    # Area scaling of the one frame to the size of the other: identity for equal sizes.
+    sx, sy = (t / s for s, t in zip(source.size_px, target.size_px, strict=True))
+    scaling = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+    if start is not None:
+        yield "start", start
+    yield "identity", normalise_homography(scaling)
+    if not rescue:
+        return
+    small_a, small_b = _without_masked(source), _without_masked(target)
+    # Both rescues measure as if b had the size of a.
+    H, _ = phase_correlation(small_a, small_b, source.size_px)
+    yield "phase correlation", normalise_homography(scaling @ H)
+    found = match_features(small_a, small_b, source.size_px)
+    if found is not None:
+        yield "features", normalise_homography(scaling @ found)
+
+
+def _without_masked(pyramid: Pyramid) -> NDArray[np.uint8]:
+    """The small picture for a rescue, masked pixels filled in from around them.
+
+    A masked graphic stands still in both pictures: left in, it makes the peak at zero and matches its own features.
+    """
+    small = small_gray(pyramid)
+    if pyramid.mask is None:
+        return small
+    h, w = small.shape
+    usable = cv2.resize(pyramid.mask, (w, h), interpolation=cv2.INTER_NEAREST)
+    if usable.all() or not usable.any():
+        return small
+    hidden = cv2.dilate((1 - usable).astype(np.uint8), np.ones((3, 3), np.uint8))
+    return np.asarray(cv2.inpaint(small, hidden, 3, cv2.INPAINT_TELEA), np.uint8)
