@@ -30,6 +30,7 @@ from pipelines.bridge import CameraPlacement, CameraPose, homography_graph
 from pipelines.config import Config
 from pipelines.decode import Frame
 from pipelines.keyframe_graph import KeyframeImages, KeyframeOptions, KeyframeResult, refine_keyframes
+from pipelines.links import without_doubtful
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
 from pipelines.table import FrameFacts, blank_rows, concatenate, shot_rows
@@ -125,9 +126,12 @@ def solve_shot(
     shot_facts = [facts[o.frame] for o in tracker.observations]
     usable = config.panorama.enabled and np.isfinite(approximate.log_f).sum() >= 1
     if not usable:
+        keyed = [f for f in tracker.fits if f.src in tracker.keyframes]
+        approximate, doubtful = without_doubtful(approximate, [*result.fits, *keyed])
         rows = shot_rows(
-            shot=shot, facts=shot_facts, solution=approximate, verdict=verdict, level=head, fits=tracker.fits
-        )
+            shot=shot, facts=shot_facts, solution=approximate, verdict=verdict, level=head, fits=tracker.fits,
+            doubtful=doubtful,
+        )  # fmt: skip
         why = "switched off" if not config.panorama.enabled else "no frame has a camera"
         return CalibratedShot(
             solution=approximate, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, tracker.fits),
@@ -145,6 +149,7 @@ def solve_shot(
         )
         with timings.measure("poses"):
             solution = _poses(tracker, result, [*fits, *_steps(tracker)])
+            solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
         with timings.measure("composite"):
             placements = placements_of(solution, world, tracker.observations, tracker.size_px)
             panorama = composite(
@@ -153,7 +158,9 @@ def solve_shot(
             )  # fmt: skip
     finally:
         store.close()
-    rows = shot_rows(shot=shot, facts=shot_facts, solution=solution, verdict=verdict, level=head, fits=fits)
+    rows = shot_rows(
+        shot=shot, facts=shot_facts, solution=solution, verdict=verdict, level=head, fits=fits, doubtful=doubtful
+    )
     return CalibratedShot(
         solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
         rows=rows, panorama=panorama, no_panorama="", timings=timings,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -44,11 +44,13 @@ def shot_rows(
     verdict: Verdict,
     level: Level | None,
     fits: Iterable[PairFit],
+    doubtful: Collection[int] = (),
 ) -> CameraTable:
     """camera.csv rows of one shot, a row per frame of `facts`, in their order.
 
     Frames that the solution lacks are bridged between solved neighbours (status 'interpolated') or 'lost'. Angles are
-    in the levelled head frame when `level` is observable, else in the reference camera's axes.
+    in the levelled head frame when `level` is observable, else in the reference camera's axes. doubtful: frames whose
+    camera was taken out because no verified pair leads to it.
     """
     n = len(facts)
     width = solution.lens.size_px[0]
@@ -84,6 +86,9 @@ def shot_rows(
     for i in range(n):
         if not have[i]:
             status[i] = "lost"
+            if facts[i].frame in doubtful:
+                reason[i] = "doubtful_link"
+                continue
             reason[i] = "misfit" if facts[i].frame in contradicted else reason[i] or "not_linked"
         elif status[i] == "interpolated":
             reason[i] = reason[i] or "bridged"

@@ -58,6 +58,13 @@ REASONS = {
         "the picture could not be linked to the rest of the shot",
         "a slower pan or less motion blur",
     ),
+    "doubtful_link": (
+        "only doubtful alignments lead to this picture; they may have followed the players",
+        "a stretch where more of the ground or the stand shows",
+    ),
+    "misfit": ("the picture contradicts a camera that only turns and zooms", ""),
+    "focal_error_above_5_percent": ("the focal length is known to worse than 5 %", "a wider pan"),
+    "between_shots": ("the picture belongs to no shot", ""),
     "bridged": ("the picture's own alignment failed; its camera lies between its neighbours'", ""),
     "focal_error_above_5_percent": ("the focal length is known, but only to worse than 5 %", PAN),
     "too_few_edges": (
