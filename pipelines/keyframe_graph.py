@@ -66,23 +66,26 @@ class KeyframeImages:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeyframeOptions:
     """max_rounds of registering and refining; settled: change of mean log f at which they stop. max_distance: widths
-    between two centres up to which keyframes are paired (1 - overlap)."""
+    between two centres up to which keyframes are paired (1 - overlap). torn_share: unlinked keyframes beyond which the
+    full model is given up for a plain one."""
 
     max_rounds: int = 8
     settled: float = 0.001
     max_distance: float = 0.8
+    torn_share: float = 0.34
     register: RegisterOptions = field(default_factory=RegisterOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeyframeResult:
-    """The refined keyframes with the graph they were refined on, its fits, and how many rounds it took."""
+    """The refined keyframes with the graph and options they were refined with, its fits, and the rounds it took."""
 
     solution: Solution
     graph: HomographyGraph
     fits: tuple[PairFit, ...]
     rounds: int
+    options: RefineOptions
 
 
 def pose_of(solution: Solution, frame: int) -> CameraPose | None:
@@ -144,9 +147,9 @@ def refine_keyframes(
         log.debug("keyframe round %d: mean log f moved by %.5f", rounds, change)
         if rounds > 1 and abs(change) < options.settled:
             break
-    result = KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=rounds)
+    result = KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=rounds, options=options.refine)
     lost = int((~np.isfinite(solution.log_f)).sum())
-    if lost and len(frames) > 1:
+    if lost > options.torn_share * len(frames) and len(frames) > 1:
         plain = _without_lens(templates, images, first_fits, n_levels, mask, priors, options, size_px)
         if int((~np.isfinite(plain.solution.log_f)).sum()) < lost:
             return plain
@@ -180,7 +183,7 @@ def _without_lens(
         fits = (*(f for f in fits if (f.src, f.dst) not in better), *new)
         graph = homography_graph(frames, fits, size_px)
         solution = refine(graph, start=solution, priors=priors, options=plain)
-    return KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=1)
+    return KeyframeResult(solution=solution, graph=graph, fits=fits, rounds=1, options=plain)
 
 
 def _best_linked(graph: HomographyGraph) -> int:

@@ -114,9 +114,9 @@ def solve_shot(
             priors=priors,
             options=KeyframeOptions(refine=refine_options, register=tracker.register_options),
         )
-        result = _with_central_reference(result, priors, refine_options)
-        result = _with_known_focal(result, tracker, config, priors, refine_options)
-        verdict = judge(result.solution, result.graph, GateOptions(refine=refine_options))
+        result = _with_central_reference(result, priors)
+        result = _with_known_focal(result, tracker, config, priors)
+        verdict = judge(result.solution, result.graph, GateOptions(refine=result.options))
         head = level(result.solution)
         if not verdict.sigma_log_f_total < LEVEL_SIGMA:
             # An axis found with a focal that is not known is as wrong as that focal.
@@ -159,7 +159,13 @@ def solve_shot(
     finally:
         store.close()
     rows = shot_rows(
-        shot=shot, facts=shot_facts, solution=solution, verdict=verdict, level=head, fits=fits, doubtful=doubtful
+        shot=shot,
+        facts=shot_facts,
+        solution=solution,
+        verdict=verdict,
+        level=head,
+        fits=fits,
+        doubtful=doubtful,
     )
     return CalibratedShot(
         solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
@@ -207,7 +213,7 @@ def placements_of(
     ]
 
 
-def _with_central_reference(result: KeyframeResult, priors: Priors, options: RefineOptions) -> KeyframeResult:
+def _with_central_reference(result: KeyframeResult, priors: Priors) -> KeyframeResult:
     """The same keyframes in the axes of the one nearest to the middle of the motion.
 
     A planar panorama about the end of a pan is all foreshortening, and homographies to it are long.
@@ -222,13 +228,16 @@ def _with_central_reference(result: KeyframeResult, priors: Priors, options: Ref
     if central == solution.reference:
         return result
     refined = refine(
-        result.graph, start=solution.with_reference(central), priors=priors, options=replace(options, reference=central)
+        result.graph,
+        start=solution.with_reference(central),
+        priors=priors,
+        options=replace(result.options, reference=central),
     )
     return replace(result, solution=refined) if np.isfinite(refined.log_f).any() else result
 
 
 def _with_known_focal(
-    result: KeyframeResult, tracker: ShotTracker, config: Config, priors: Priors, options: RefineOptions
+    result: KeyframeResult, tracker: ShotTracker, config: Config, priors: Priors
 ) -> KeyframeResult:
     """The keyframes refined again with the user's focal, when there is one and it belongs to this shot.
 
@@ -256,7 +265,7 @@ def _with_known_focal(
         result.graph,
         start=result.solution,
         priors=with_focal,
-        options=replace(options, reference=result.solution.reference),
+        options=replace(result.options, reference=result.solution.reference),
     )
     return replace(result, solution=refined) if np.isfinite(refined.log_f).any() else result
 
@@ -349,7 +358,10 @@ def _second_pass(
     first, last = tracker.observations[0].frame, tracker.observations[-1].frame
     planned = set(plan.frames)
     retracker = Retracker(
-        tracker=tracker, approximate=approximate, options=config.registration, register_options=tracker.register_options
+        tracker=tracker,
+        approximate=approximate,
+        options=config.registration,
+        register_options=tracker.register_options,
     )
     while True:
         with timings.measure("decode again"):
@@ -372,7 +384,9 @@ def _second_pass(
 
 def _graph(tracker: ShotTracker, fits: Sequence[PairFit]) -> MotionGraph:
     return MotionGraph(
-        frames=np.array([o.frame for o in tracker.observations], np.int64), fits=tuple(fits), size_px=tracker.size_px
+        frames=np.array([o.frame for o in tracker.observations], np.int64),
+        fits=tuple(fits),
+        size_px=tracker.size_px,
     )
 
 
