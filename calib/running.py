@@ -42,6 +42,8 @@ class RunningOptions:
     cold_at: keyframe counts at which the adjustment starts from scratch (multistart), so that an early wrong basin does
     not last. max_scale: robust residual scale, in stated sigmas, beyond which a frame's pose is refused.
     keep_frames: recent poses kept so that edges may name them.
+    two_view_motion, two_view_growth: rms motion in widths, and its growth since, at which the first keyframe and the
+    newest frame are calibrated from scratch while there is no second keyframe (.1 s each).
     """
 
     window: int = 24
@@ -49,6 +51,8 @@ class RunningOptions:
     cold_at: tuple[int, ...] = (2, 3, 5, 8, 13)
     max_scale: float = 8.0
     keep_frames: int = 8
+    two_view_motion: float = 0.005
+    two_view_growth: float = 1.25
     max_sigma: float = 0.1
     refine: RefineOptions = field(default_factory=RefineOptions)
     gates: GateOptions = field(default_factory=GateOptions)
@@ -396,7 +400,7 @@ class RunningCalibrator:
             return
         shift = mine[0].grid_b[known] - mine[0].grid_a[known]
         moved = float(np.sqrt(np.mean(np.sum(shift**2, 1)))) / self.size_px[0]
-        if moved < max(0.005, 1.25 * self._two_view_motion):
+        if moved < max(self.options.two_view_motion, self.options.two_view_growth * self._two_view_motion):
             return
         graph = HomographyGraph(frames=np.array([key, frame]), edges=mine, size_px=self.size_px)
         solution = refine(graph, priors=self.priors, options=replace(self.options.refine, reference=key))

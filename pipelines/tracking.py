@@ -38,6 +38,8 @@ MAX_LINKS = 6  # earlier keyframes that a new one is registered to: nearest and 
 # The running estimate only has to stay locked: fewer starts and an earlier stop than the refinement over the shot.
 RUNNING = RunningOptions(
     cold_at=(3, 6),
+    two_view_motion=0.02,
+    two_view_growth=1.5,
     refine=RefineOptions(
         k1_trials=(-0.02, 0.01, 0.04),
         focal_trials_w=(1.0, 2.0, 3.5),
