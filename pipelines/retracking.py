@@ -20,7 +20,10 @@ from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import distance_in_widths
 from pipelines.tracking import ShotTracker
 
-LINKS = 2  # keyframes that a frame is registered to: two, so that nothing jumps where the nearest one changes
+# Keyframes that a frame is registered to: two where the second is hardly farther than the nearest, so that nothing
+# jumps where they change places.
+LINKS = 2
+SECOND = 2.0
 
 
 @dataclass(slots=True, eq=False)
@@ -50,7 +53,8 @@ class Retracker:
         pose = self.pose(frame)
         if pose is None or frame in self.tracker.keyframes:
             return []  # keyframes were registered to each other until they settled, and are held
-        wanted = self._nearest(frame, pose)[:LINKS]
+        near = self._nearest(frame, pose)
+        wanted = [index for distance, index in near[:LINKS] if distance <= SECOND * near[0][0] + 0.02]
         new = []
         for index in wanted:
             key_pose = self.pose(index)
@@ -77,8 +81,8 @@ class Retracker:
             self._prepared[index] = prepare(self.tracker.keyframes[index].template, family)
         return self._prepared[index]
 
-    def _nearest(self, frame: int, pose: CameraPose) -> list[int]:
-        """Keyframes by displacement in widths; at least `min_overlap` of the picture in common."""
+    def _nearest(self, frame: int, pose: CameraPose) -> list[tuple[float, int]]:
+        """(displacement in widths, keyframe), nearest first; at least `min_overlap` of the picture in common."""
         found = []
         width = self.tracker.size_px[0]
         for index in self.tracker.keyframes:
@@ -88,4 +92,4 @@ class Retracker:
             distance = distance_in_widths(other, pose, width)
             if distance < 1.0 - self.options.min_overlap:
                 found.append((distance, index))
-        return [index for _, index in sorted(found)]
+        return sorted(found)
