@@ -132,9 +132,12 @@ def spanning_tree(
     root: int | NDArray[np.int64],
     frames: NDArray[np.int64],
     trusted: NDArray[np.bool_] | None = None,
+    *,
+    few_steps: bool = False,
 ) -> list[TreeEdge]:
-    """Steps from the root row(s) outwards over the shortest trusted edges, in breadth-first order.
+    """Steps from the root row(s) outwards over the shortest trusted edges, each after the one it hangs on.
 
+    few_steps: fewest edges from a root instead, so that errors do not add up along hundreds of frame-to-frame edges.
     An edge outside `trusted` (E,) is used only where nothing else leads. Frames without a path are not in the list.
     Edges without information are not used.
     """
@@ -157,8 +160,12 @@ def spanning_tree(
     cols = np.array([k[1] for k in keys] + roots.tolist(), int)
     values = np.array([weight[best[k]] for k in keys] + [1e-6] * len(roots), float)
     graph = sp.csr_array((values, (rows, cols)), shape=(n + 1, n + 1))
-    tree = csgraph.minimum_spanning_tree(graph)
-    order, predecessor = csgraph.breadth_first_order(tree, n, directed=False)
+    if few_steps:
+        length, predecessor = csgraph.dijkstra(graph, directed=False, indices=n, return_predecessors=True)
+        order = np.argsort(length, kind="stable")[: int(np.isfinite(length).sum())]
+    else:
+        tree = csgraph.minimum_spanning_tree(graph)
+        order, predecessor = csgraph.breadth_first_order(tree, n, directed=False)
     start = set(roots.tolist())
     steps = []
     for child in order[1:].tolist():

@@ -310,7 +310,7 @@ def state_from_solution(packed: Packed, frames: NDArray[np.int64], start: Soluti
         log_f[0, reference], R[0, reference] = np.log(1.3), np.eye(3)
     if len(known) < n:
         k1 = np.array([float(lens.k1_half(np.mean(log_f[0, known]) + packed.log_width))])
-        tree = linear.spanning_tree(packed, known, frames)
+        tree = linear.spanning_tree(packed, known, frames, few_steps=True)
         used = np.array(sorted({step.edge for step in tree}), int)
         H = np.full((1, packed.n_edges, 3, 3), np.nan)
         if len(used):
