@@ -314,12 +314,26 @@ def _as_document(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @app.command("probe")
-def _probe(context: typer.Context, clip: Path, as_json: AsJson = False) -> int:
-    """What a file is: size, rate, scan, colour, time code. No processing."""
+def _probe(
+    context: typer.Context,
+    clip: Path,
+    shots: Annotated[
+        bool, typer.Option("--shots/--no-shots", help="Look for shots and fixed graphics; else read the header only.")
+    ] = True,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="Seconds of the clip that are looked at; 0: all of it.")
+    ] = 60.0,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> int:
+    """What a file is: size, rate, scan, colour, time code; shots and overlays by a quick look."""
     settings = _settings(context, None)
+    _set_up_logging(quiet, False)
     from pipelines.probe import probe, probe_text
+    from pipelines.progress import TerminalProgress
 
-    facts = probe(clip, settings.decode)
+    with TerminalProgress(show=not quiet) as progress:
+        facts = probe(clip, settings, shots=shots, seconds=seconds or None, progress=progress)
     if as_json:
         _print_json({"exit_code": EXIT_OK, **facts})
     else:

@@ -1,4 +1,4 @@
-"""What a clip is, from its header and its first two pictures. Nothing is registered."""
+"""What a clip is, from its header and its first two pictures; its shots and fixed graphics from a cheap first pass."""
 
 from __future__ import annotations
 
@@ -7,23 +7,62 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipelines.config import DecodeOptions
+from pipelines.config import Config
 from pipelines.decode import open_clip
+from pipelines.progress import Progress, silent
 
-NEEDS_REGISTRATION = "found by registering the frames to each other: `run` does it"
+SECONDS = 60.0  # of the clip that are looked at; about as long as that takes on two slow cores at 1080p
+NOT_ASKED = "not_looked_for"
+REASONS = {
+    NOT_ASKED: "not looked for (--no-shots)",
+    "switched_off": "switched off (overlays.enabled)",
+    "camera_moved_too_little": "the camera moved too little to tell graphics from the scene",
+    "too_much_looks_fixed": "so much looks fixed that the camera has hardly moved",
+}
 
 
-def probe(path: str | Path, options: DecodeOptions | None = None) -> dict[str, Any]:
-    """The facts of a clip, JSON-ready; `shots` and `overlays` say that they are not estimated, and why.
+def probe(
+    path: str | Path,
+    config: Config | None = None,
+    *,
+    shots: bool = True,
+    seconds: float | None = SECONDS,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The facts of a clip, JSON-ready: ClipFacts.as_dict() with `shots` and `overlays`, whose keys are always there.
 
+    shots, overlays: estimated (bool), reason ('' or a code of REASONS) and what was found. shots: list of first_frame,
+    last_frame, n_frames, start_s, end_s, ended_by ('cut', 'end', 'limit' of what was looked at), motion_px_per_frame
+    (median, or None), n_frames, n_frames_in_no_shot, complete (the clip's end was reached), seconds. overlays: as
+    OverlayFinder.facts. `shots` off: only header and two pictures are read. seconds: None looks at the whole clip.
     Raises InputError as `open_clip` does, and for a clip of one picture.
     """
-    with open_clip(path, options) as clip:
+    config = config or Config()
+    with open_clip(path, config.decode) as clip:
         for _ in clip.frames(0, 2):
             pass
-        facts = clip.facts.as_dict()
-    not_known = {"estimated": False, "reason": NEEDS_REGISTRATION}
-    return {**facts, "shots": not_known, "overlays": not_known}
+        if shots:
+            from pipelines.first_look import look_at
+
+            found = look_at(clip, config, seconds=seconds, progress=progress)
+        else:
+            found = _not_looked_for()
+        return {**clip.facts.as_dict(), **found}
+
+
+def _not_looked_for() -> dict[str, Any]:
+    nothing = {"estimated": False, "reason": NOT_ASKED}
+    return {
+        "shots": {
+            **nothing,
+            "seconds": 0.0,
+            "complete": False,
+            "n_frames": 0,
+            "n_frames_in_no_shot": 0,
+            "list": [],
+        },
+        "overlays": {**nothing, "samples": 0, "graphics": [], "bars": {}, "masked_share": None},
+    }
 
 
 def probe_text(facts: Mapping[str, Any]) -> str:
@@ -51,8 +90,8 @@ def probe_text(facts: Mapping[str, Any]) -> str:
         ("colour", f"matrix {colour['space']}, range {colour['range']}, primaries {colour['primaries']}, transfer "
                    f"{colour['transfer']} (2 = not tagged); RGB by {colour['rgb_matrix']}"),
         ("timecode", facts["timecode"] or "none"),
-        ("shots", f"not estimated: {facts['shots']['reason']}"),
-        ("overlays", f"not estimated: {facts['overlays']['reason']}"),
+        *_shot_lines(facts["shots"]),
+        ("overlays", _overlays(facts["overlays"])),
         *(("note", warning) for warning in facts["warnings"]),
     ]  # fmt: skip
     return "\n".join(f"{name:<9} {value}" for name, value in lines)
@@ -66,3 +105,35 @@ def _length(facts: Mapping[str, Any]) -> str:
     ]
     said = ", ".join(part for part in parts if part)
     return f"{said} by its header, which may be wrong" if said else "not stated"
+
+
+def _shot_lines(shots: Mapping[str, Any]) -> list[tuple[str, str]]:
+    if not shots["estimated"]:
+        return [("shots", REASONS[shots["reason"]])]
+    found = shots["list"]
+    looked = "" if shots["complete"] else f" in the first {shots['seconds']:g} s"
+    left = shots["n_frames_in_no_shot"]
+    head = f"{len(found)}{looked}, by a quick look" + (f"; {left} pictures in none" if left else "")
+    ends = {"cut": "then a cut", "end": "then the end", "limit": "and on"}
+    lines = [("shots", head)]
+    for number, shot in enumerate(found):
+        motion = shot["motion_px_per_frame"]
+        moves = "" if motion is None else f", moves {motion:.1f} px/frame"
+        lines.append(
+            (
+                f"  {number}",
+                f"{shot['start_s']:.2f} to {shot['end_s']:.2f} s, frames {shot['first_frame']} to "
+                f"{shot['last_frame']}{moves}, {ends[shot['ended_by']]}",
+            )
+        )
+    return lines
+
+
+def _overlays(overlays: Mapping[str, Any]) -> str:
+    parts = [f"{box['w']}x{box['h']} at {box['x']},{box['y']}" for box in overlays["graphics"]]
+    bars = [f"{length} px {side}" for side, length in overlays["bars"].items() if length]
+    if bars:
+        parts.append(f"bars {', '.join(bars)}")
+    if not overlays["estimated"]:
+        parts.append(REASONS[overlays["reason"]])
+    return "; ".join(parts) or "none found"

@@ -262,7 +262,10 @@ def test_probe_states_the_facts(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert cli.main(["probe", str(path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["size_px"] == [64, 48] and facts["fps"] == 25 and facts["timecode"] == "10:00:00:00"
-    assert facts["shots"]["estimated"] is False and facts["shots"]["reason"]
+    # Ramps with no texture to register: no picture hangs together with the next, so there is no shot.
+    assert facts["shots"]["estimated"] is True and facts["shots"]["list"] == []
+    assert facts["shots"]["n_frames"] == facts["shots"]["n_frames_in_no_shot"] == 12
+    assert facts["overlays"]["estimated"] is False and facts["overlays"]["reason"]
     assert cli.main(["probe", str(path)]) == 0
     text = capsys.readouterr().out
     assert "64x48 (4:3)" in text and "progressive" in text and "h264" in text
