@@ -238,6 +238,8 @@ def _from_scratch(
     layout = Layout(fine, reference, free)
     cost = linearise(fine, here, common).cost + terms.cost(here)
     kept = _distinct(cost, here.log_f.mean(1), here.shared[:, 3])
+    if not len(kept):
+        return None  # every start is an impossible camera for the full set of points
     if len(kept) > 3:
         leading = minimise(
             fine,
