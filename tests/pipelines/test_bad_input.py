@@ -15,6 +15,8 @@ from pipelines import cli
 from tests.pipelines.clips import write_audio, write_clip
 from tests.pipelines.end_to_end import Finished, digests, one_line
 
+pytestmark = pytest.mark.slow  # whole runs
+
 
 def _text(folder: Path, clip: Path) -> Path:
     (folder / "text.mp4").write_text("not a video\n" * 50)

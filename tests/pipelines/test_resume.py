@@ -15,6 +15,8 @@ import pytest
 
 from tests.pipelines.end_to_end import Finished, digests, run
 
+pytestmark = pytest.mark.slow  # whole runs
+
 WAIT_S = 120.0
 
 

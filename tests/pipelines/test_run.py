@@ -22,6 +22,8 @@ from tests.pipelines.conftest import CUT
 from tests.pipelines.end_to_end import SIZE, Finished, corner_errors_px, run, true_homographies
 from tests.synth.camera import rotation_cam_world
 
+pytestmark = pytest.mark.slow  # whole runs
+
 # "What a run writes", product contract.
 OUTPUTS = {
     "run.json",

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.pipelines.conftest import CUT, FLASH, N_CUT, REPEATS
 from tests.pipelines.end_to_end import Finished
+
+pytestmark = pytest.mark.slow  # whole runs
 
 REGISTERED = {"ok", "weak", "relative"}
 

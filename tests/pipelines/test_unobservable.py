@@ -12,6 +12,8 @@ from tests.pipelines.end_to_end import Finished, corner_errors_px, run, small_sp
 from tests.synth.clip import write_clip
 from tests.synth.paths import PathSpec
 
+pytestmark = pytest.mark.slow  # whole runs
+
 NOT_CLAIMED = ("f_px", "f_std_px", "f_stat_px", "hfov_deg", "pan_deg", "tilt_deg", "roll_deg")
 KINDS = ("pure_zoom", "locked_off")
 
