@@ -18,6 +18,7 @@ WEAK_SIGMA = 0.05  # f_std_px / f_px above which a frame is 'weak' (product.md)
 # rms residual of a frame's edges beyond which its camera contradicts its pictures: px, and share of the width.
 MISFIT_PX = 2.0
 MISFIT_W = 0.004
+ZOOM_FLOOR_PX = 0.1
 INTERPOLATED_INFLATION = 3.0  # error bars of a bridged frame against its neighbours'
 
 FloatArray = NDArray[np.float64]
@@ -81,7 +82,9 @@ def shot_rows(
     reference = row_of.get(solution.reference)
     log_f_ref = float(solution.log_f[reference]) if reference is not None else np.nan
     zoom = np.exp(log_f - log_f_ref)
-    zoom_systematic = float(verdict.sigma_parts.get("systematic_px", 0.0)) / (solution.lens.size_px[0] / 4.0)
+    # What frames share in px, at a quarter of the width from the middle; a shot that cannot say has at least a tenth.
+    shared_px = float(np.nan_to_num(verdict.sigma_parts.get("systematic_px", 0.0)))
+    zoom_systematic = max(shared_px, ZOOM_FLOOR_PX) / (solution.lens.size_px[0] / 4.0)
 
     for i in range(n):
         if not have[i]:
