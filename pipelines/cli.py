@@ -318,7 +318,10 @@ def _probe(
     context: typer.Context,
     clip: Path,
     shots: Annotated[
-        bool, typer.Option("--shots/--no-shots", help="Look for shots and fixed graphics; else read the header only.")
+        bool,
+        typer.Option(
+            "--shots/--no-shots", help="Look for shots and fixed graphics; else read the header only."
+        ),
     ] = True,
     seconds: Annotated[
         float, typer.Option(min=0.0, help="Seconds of the clip that are looked at; 0: all of it.")

@@ -39,9 +39,7 @@ class _Bwdif:
         self._frame_s = 0.04
         graph = av.filter.Graph()
         unit = Fraction(1, 1000)
-        source = graph.add_buffer(
-            width=like.width, height=like.height, format=like.format, time_base=unit
-        )
+        source = graph.add_buffer(width=like.width, height=like.height, format=like.format, time_base=unit)
         bwdif = graph.add("bwdif", f"mode=send_{mode}:parity=auto:deint=interlaced")
         sink = graph.add("buffersink")
         source.link_to(bwdif)

@@ -77,7 +77,11 @@ class _Job:
 
 
 def process(
-    clip: Path, out: Path, config: Config | None = None, progress: Progress | None = None, resume: bool = False
+    clip: Path,
+    out: Path,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    resume: bool = False,
 ) -> RunRecord:
     """Run everything on one clip and write OUT (README: what a run writes).
 
@@ -130,7 +134,8 @@ def _first_pass(job: _Job) -> None:
     register = RegisterOptions(kernel=config.registration.kernel)
 
     def new_tracker() -> ShotTracker:
-        tracker = ShotTracker(size_px, config.registration, priors_of(config, job.clip.facts.pixel_aspect), register_options=register)
+        priors = priors_of(config, job.clip.facts.pixel_aspect)
+        tracker = ShotTracker(size_px, config.registration, priors, register_options=register)
         tracker.images = KeyframeImages(job.scratch)
         job.images[id(tracker)] = tracker.images
         return tracker

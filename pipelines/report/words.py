@@ -63,7 +63,6 @@ REASONS = {
         "a stretch where more of the ground or the stand shows",
     ),
     "misfit": ("the picture contradicts a camera that only turns and zooms", ""),
-    "focal_error_above_5_percent": ("the focal length is known to worse than 5 %", "a wider pan"),
     "between_shots": ("the picture belongs to no shot", ""),
     "bridged": ("the picture's own alignment failed; its camera lies between its neighbours'", ""),
     "focal_error_above_5_percent": ("the focal length is known, but only to worse than 5 %", PAN),
