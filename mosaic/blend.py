@@ -76,7 +76,7 @@ def sample_view(image, trust, still, grid, step, gain, margin, feather, cubic, o
     image (H, W, 3) uint8. trust and still: uint8 planes over the same frame at any resolution, 255 = the scene at
     rest, nearest pixel taken; a (1, 1) plane holds for the whole frame. grid (rows, columns, 4) float32: frame x, y,
     vote and weight 0..1 at every `step`-th tile pixel, linear in between. gain (3,) multiplies the channels. A sample
-    nearer than `margin` px to the frame's border, or of trust or vote 0, is not seen; from there vote and weight
+    nearer than `margin` px to the frame's border, or of trust, still or vote 0, is not seen; from there vote and weight
     rise over `feather` px, so that no frame edge shows. Both are multiplied by trust / 255 and by still / 255.
     Out, uint8: out (3, h, w); out_vote (h, w), 0 = not seen, else at least 1; out_weight (h, w), likewise.
     Catmull-Rom (cubic) or linear, with float weights (cv2.remap rounds positions to 1/32 px).
@@ -128,6 +128,8 @@ def sample_view(image, trust, still, grid, step, gain, margin, feather, cubic, o
                 if sure == 0:
                     continue
                 rest = still[int((y + rounding) * still_y), int((x + rounding) * still_x)]
+                if rest == 0:
+                    continue
                 ramp *= np.float32(sure) * np.float32(rest) * (one / (full * full))
                 s, t = x - np.float32(xi), y - np.float32(yi)
                 if cubic:

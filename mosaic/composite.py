@@ -100,6 +100,7 @@ def composite(
     scene = Scene(
         surface=surface, store=store, views=views, gains=gains.astype(np.float32), lattice=lattice,
         floor=floor.reshape(vote.shape[1:]), vote=vote, options=options,
+        still=tuple(store.still(p.frame) for p in views),
     )  # fmt: skip
     if options.motion_rounds > 0:
         scene = replace(scene, still=find_still(scene))

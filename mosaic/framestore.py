@@ -68,6 +68,8 @@ class FrameStore:
         self._cache: OrderedDict[tuple[int, int], StoredFrame] = OrderedDict()
         self._cached_bytes = 0
         self._spare: list[NDArray[np.uint8]] = []
+        self._still: dict[int, NDArray[np.uint8]] = {}
+        self._screen: NDArray[np.bool_] | None = None
         self._lock = threading.Lock()
 
     @property
@@ -112,6 +114,30 @@ class FrameStore:
             self._trust_of[frame] = self._put_trust(plane)
         self._coarse[frame] = (np.asarray(coarse, dtype=np.uint8), coarse_trust)
         self._offset[frame] = self._append(np.ascontiguousarray(rgb))
+
+    def put_still(self, frame: int, plane: NDArray[np.uint8]) -> None:
+        """How sure it is that a frame's pixels are at rest, found later than its picture: (h, w) uint8 at any
+        resolution over the frame, 255 = at rest, low = moves, 0 = not the scene. Kept in memory."""
+        if plane.ndim != 2 or plane.dtype != np.uint8:
+            raise ValueError(f"plane of frame {frame} is {plane.dtype} {plane.shape}, need uint8 (h, w)")
+        self._still[frame] = plane
+
+    def put_screen(self, mask: NDArray[np.bool_] | None) -> None:
+        """What is stuck to the screen in all frames: (h, w) bool at any resolution, True = scene; None: nothing."""
+        self._screen = mask
+
+    def still(self, frame: int) -> NDArray[np.uint8]:
+        """put_still's plane with 0 under the screen's graphics; 255 all over where nothing is known."""
+        plane = self._still.get(frame)
+        if self._screen is None:
+            return np.full((1, 1), 255, np.uint8) if plane is None else plane
+        if plane is None:
+            return np.where(self._screen, np.uint8(255), np.uint8(0))
+        size = (plane.shape[1], plane.shape[0])
+        scene = self._screen
+        if scene.shape != plane.shape:
+            scene = cv2.resize(scene.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        return np.where(scene, plane, np.uint8(0))
 
     def _trust_plane(
         self, mask: NDArray[np.bool_] | None, trust: NDArray[np.uint8] | NDArray[np.floating] | None

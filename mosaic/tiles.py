@@ -145,7 +145,7 @@ def _tile_maps(scene: Scene, x0: int, y0: int, width: int, height: int) -> list[
                     break
         here = at if step == GRID_PX else _lattice_at(scene.lattice, xy.shape[:2], x0, y0, step)
         central = centrality(xy, placement.size_px, scene.options.margin_px)
-        ratio = _ratio(resolution(placement), _floor(scene, *here))
+        ratio, sharp = _ratio(resolution(placement), _floor(scene, *here))
         vote = _bilinear(scene.vote[index], *here)
         member = _bilinear((scene.vote[index] > 0).astype(np.float32), *here)
         # A cell cut by the frame's border must not lose its half inside because its outer corner weighs nothing;
@@ -158,8 +158,8 @@ def _tile_maps(scene: Scene, x0: int, y0: int, width: int, height: int) -> list[
         grid[..., :2] = np.where(np.isfinite(xy), (xy - (shrink - 1) / 2) / shrink, UNSEEN)
         # To decide what stands still, who sees it best counts a little; to paint it, the sharp views count most.
         grid[..., 2] = vote * (0.3 + 0.7 * inside) * ratio**2
-        grid[..., 3] = member * inside * ratio**4
-        found.append((float((central * grid[..., 3]).sum()), int(index), grid, step, shrink))
+        grid[..., 3] = member * inside * np.maximum(sharp**4, 0.002 * ratio)
+        found.append((float((central * (grid[..., 2] + grid[..., 3])).sum()), int(index), grid, step, shrink))
     if not found:
         return []
     heaviest = np.max([entry[2][..., 2:].max(axis=(0, 1)) for entry in found], axis=0)
@@ -170,11 +170,13 @@ def _tile_maps(scene: Scene, x0: int, y0: int, width: int, height: int) -> list[
     return [entry[1:] for entry in found]
 
 
-def _ratio(fineness: float, floor: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Resolution over the floor's, at most 2, fading to 0 from the floor to 15 % below it."""
+def _ratio(
+    fineness: float, floor: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Resolution over the floor's, at most 2; and the same fading to 0 from the floor to 15 % below it."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(floor > 0, fineness / floor, 1.0)
-    return np.minimum(ratio, 2.0) * np.clip((ratio - 0.85) / 0.15, 0.0, 1.0)
+        ratio = np.minimum(np.where(floor > 0, fineness / floor, 1.0), 2.0)
+    return ratio, ratio * np.clip((ratio - 0.85) / 0.15, 0.0, 1.0)
 
 
 def _shrink(xy: NDArray[np.float64], step: int) -> int:

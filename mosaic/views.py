@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 
 from mosaic.surface import Placement, Surface
 
+LEAST_RATIO = 0.25  # of the resolution floor: a view coarser than this does not even vote
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompositeOptions:
     """views: K, good views wanted at each point (measured: 15 to 25, more buys nothing). tile_px: side of the tiles
     worked on at a time. finer: zoom ratio from which a sharper view displaces a coarser one. min_span: frames that
-    the K sharpest views of a point must span before coarser ones are left out (2 s at 25 fps: a player has moved).
+    the K sharpest views of a point must span before coarser ones are left out (4 s at 25 fps: a player has moved).
     min_gap: frames between views below which one more of the same place is not worth storing.
     pool: frames kept, as a multiple of K times (panorama area / frame area). margin_px, feather: border of a frame
     that is not used, and share of its width over which its weight rises. cubic: Catmull-Rom, else linear.
@@ -36,7 +38,7 @@ class CompositeOptions:
     views: int = 17
     tile_px: int = 512
     finer: float = 1.3
-    min_span: int = 50
+    min_span: int = 100
     min_gap: float = 3.0
     pool: float = 2.5
     margin_px: float = 3.0
@@ -45,12 +47,12 @@ class CompositeOptions:
     floor: float = 3.0
     cap: float = 10.0
     doubt: float = 6.0
-    max_views: int = 40
+    max_views: int = 56
     threads: int = 2
     memory_bytes: int = 200_000_000
     max_candidates: int = 1200
     gains: bool = True
-    motion_rounds: int = 0
+    motion_rounds: int = 3
 
     def __post_init__(self) -> None:
         if not 1 <= self.views <= self.max_views <= 255:
@@ -250,7 +252,8 @@ def share_views(
 ) -> NDArray[np.float32]:
     """Votes 0..1 of the views at the lattice points, (n, ny, nx), 0 = does not count; interpolated in between.
 
-    At most K views a point (a third of K from rare close-ups first), far apart in time. Views of one moment share
+    At most K views a point (a third of K from rare close-ups first), far apart in time, and half as many coarser ones,
+    which may be the only ones to show the ground. Views of one moment share
     a vote: a player who stands still for two seconds is one observation, however often he was filmed meanwhile.
     A point that fewer than K see also takes the frames that nearly reach it, nearest first: a frame
     that covers a part of a lattice cell may see none of its corners. scale_px: px per radian of the surface.
@@ -264,7 +267,9 @@ def share_views(
     fine = np.array([resolution(p) for p in placements])[:, None] >= 0.85 * rating.floor
     near = np.where((rating.quality == 0) & fine & (reach < 0), np.maximum(1 + reach / cell, 0.0), 0.0)
     shape = (len(placements), ny, nx)
+    coarse = np.where((reach > options.margin_px) & ~fine, np.sqrt(_clipped_ratio(placements, rating.floor)), 0.0)
     quality, rare, near = rating.quality.reshape(shape), rating.rare.reshape(shape), near.reshape(shape)
+    coarse = coarse.reshape(shape)
     taken = np.zeros(shape, bool)
     before = np.zeros(shape[:2], bool)
     for column in range(nx):
@@ -275,8 +280,18 @@ def share_views(
         )
         here = _spread_in_time(liked, time, options.views, here)
         here = _spread_in_time(near[:, :, column], None, options.views, here)
-        taken[:, :, column] = before = here
+        before = here
+        # Coarser or blurred views of other moments cannot add detail, but may be the only ones that show the ground.
+        wanted = here.sum(axis=0) + -(-options.views // 2)
+        taken[:, :, column] = _spread_in_time(coarse[:, :, column], time, wanted, here)
     return _independence(taken.reshape(len(placements), -1), time, options.min_span).reshape(shape)
+
+
+def _clipped_ratio(placements: Sequence[Placement], floor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Resolution of each frame over the floor at each point (n, p), at most 1; 0 below LEAST_RATIO."""
+    fineness = np.array([resolution(p) for p in placements])[:, None]
+    ratio = np.minimum(fineness / np.maximum(floor, 1e-9), 1.0)
+    return np.where(ratio < LEAST_RATIO, 0.0, ratio)
 
 
 def _independence(taken: NDArray[np.bool_], time: NDArray[np.float64], span: float) -> NDArray[np.float32]:
@@ -286,7 +301,10 @@ def _independence(taken: NDArray[np.bool_], time: NDArray[np.float64], span: flo
 
 
 def _spread_in_time(
-    quality: NDArray[np.floating], time: NDArray[np.float64] | None, n_views: int, taken: NDArray[np.bool_]
+    quality: NDArray[np.floating],
+    time: NDArray[np.float64] | None,
+    n_views: int | NDArray[np.int_],
+    taken: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Fill every column of `taken` (n, p) up to n_views, each time by the largest quality x root of the time to the
     nearest one taken (time None: by quality alone). Returns the fuller (n, p)."""
@@ -298,7 +316,7 @@ def _spread_in_time(
         apart *= max(float(np.ptp(time)), 1.0)
         for row in np.flatnonzero(taken.any(axis=1)):
             apart[:, taken[row]] = np.minimum(apart[:, taken[row]], gap[:, row, None])
-    for _ in range(n_views):
+    for _ in range(int(np.max(n_views))):
         score = np.where(taken, 0.0, quality * np.sqrt(apart))
         best = score.argmax(axis=0)
         useful = (score[best, columns] > 0) & (taken.sum(axis=0) < n_views)

@@ -31,6 +31,7 @@ from pipelines.config import Config
 from pipelines.decode import Frame
 from pipelines.keyframe_graph import KeyframeImages, KeyframeOptions, KeyframeResult, refine_keyframes
 from pipelines.links import without_doubtful
+from pipelines.moving import MovingFinder
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
 from pipelines.table import FrameFacts, blank_rows, concatenate, shot_rows
@@ -357,6 +358,9 @@ def _second_pass(
     wanted = {o.frame for o in tracker.observations if o.reason != "duplicate"}
     first, last = tracker.observations[0].frame, tracker.observations[-1].frame
     planned = set(plan.frames)
+    # Only where frames lie relative to each other counts here: the axes of the reference will do.
+    placed = {p.frame: p for p in placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px)}
+    moving = MovingFinder(placed, planned, store)
     retracker = Retracker(
         tracker=tracker,
         approximate=approximate,
@@ -376,9 +380,13 @@ def _second_pass(
         if frame.index in planned:
             with timings.measure("keep views"):
                 store.put(frame.index, frame.picture(), mask)
+        with timings.measure("what moves"):
+            moving.push(frame.index, frame.picture)
         progress("second pass", frame.index - first + 1, last - first + 1)
         if frame.index >= last:
             break
+    with timings.measure("what moves"):
+        moving.finish()
     return retracker.fits
 
 

@@ -1,0 +1,247 @@
+"""What moves in a picture, and what is stuck to the screen: from small pictures before and after it, warped onto it.
+
+An object at this moment differs from what is seen there both earlier and later, and those two agree: that is the
+ground it covers. Ground that it has just left, or will cover soon, differs from one side only. So neighbours of both
+sides vote, each with its colour, and the nearer ones less: a slow player agrees with himself a moment ago. Who stands
+still for longer than the farthest neighbour is not seen here (mosaic.moving compares with the composite).
+
+Pictures only: where the neighbours lie comes in as a map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Plane = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionOptions:
+    """noise_grey: mean difference of the channels that noise and coding explain at the small size. detail: share of
+    the contrast of a 3 x 3 neighbourhood that a misregistration explains (a quarter: one full px at a quarter of the
+    size). alternative: weight of the neighbours that agree on another colour, over that of those which agree with
+    the picture, from which the picture is taken for an object. slow_frames: a neighbour so far away counts fully.
+    low, halo, doubtful: trust (of 255) of what moves, of what lies close round it or is enclosed by it, and of pixels
+    that nobody confirms. grow_px: small px by
+    which what moves is widened (shadow, motion blur, coding ringing). min_area_px: smaller specks are noise."""
+
+    noise_grey: float = 9.0
+    detail: float = 0.3
+    alternative: float = 0.65
+    slow_frames: float = 50.0
+    low: int = 2
+    halo: int = 24
+    doubtful: int = 100
+    grow_px: int = 2
+    min_area_px: int = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Neighbour:
+    """A small picture rgb (h, w, 3) uint8 of another moment, frames later (negative: earlier), and where the pixels of
+    the picture in question lie in it: at_px (h, w, 2) float32, anything outside where it does not see them."""
+
+    rgb: Plane
+    frames: float
+    at_px: NDArray[np.float32]
+
+
+def expand_map(nodes: NDArray[np.float64], step: int, size_px: tuple[int, int]) -> NDArray[np.float32]:
+    """A map given at every step-th pixel (rows, columns, 2), one beyond each end, at all pixels (h, w, 2)."""
+
+    def hat(n: int, n_nodes: int) -> NDArray[np.float64]:
+        return np.maximum(1 - np.abs(np.arange(n)[:, None] / step - np.arange(n_nodes)), 0.0)
+
+    across, down = hat(size_px[0], nodes.shape[1]), hat(size_px[1], nodes.shape[0])
+    far = np.where(np.isfinite(nodes), nodes, -1e6)
+    return np.stack([down @ far[..., i] @ across.T for i in (0, 1)], axis=-1).astype(np.float32)
+
+
+def tolerance(rgb: Plane, options: MotionOptions) -> NDArray[np.float32]:
+    """Difference (h, w), grey levels, that noise and a slight misregistration explain at each pixel."""
+    contrast = cv2.morphologyEx(rgb, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).mean(
+        axis=-1, dtype=np.float32
+    )
+    return np.float32(options.noise_grey) + np.float32(options.detail) * contrast
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _apart(a, b, i, j):  # type: ignore[no-untyped-def]
+    """Mean difference of the channels; the largest counts twice (white on green differs in red and blue only)."""
+    d0 = abs(np.int32(a[i, j, 0]) - np.int32(b[i, j, 0]))
+    d1 = abs(np.int32(a[i, j, 1]) - np.int32(b[i, j, 1]))
+    d2 = abs(np.int32(a[i, j, 2]) - np.int32(b[i, j, 2]))
+    return np.float32(0.25) * np.float32(d0 + d1 + d2 + max(d0, d1, d2))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _judge(now, others, seen, frames, weight, allowed, alternative, verdict):  # type: ignore[no-untyped-def]
+    """Per pixel: 2 = moves, 1 = nobody confirms it, 0 = at rest or nothing known.
+
+    others (k, h, w, 3) and seen (k, h, w): neighbours on the picture's pixels; frames, weight (k,); allowed (h, w).
+    """
+    n, height, width = seen.shape
+    off = np.empty(n, np.int32)
+    for i in range(height):
+        for j in range(width):
+            verdict[i, j] = 0
+            limit = allowed[i, j]
+            own, total, n_off, before, after = np.float32(0), np.float32(0), 0, 0, 0
+            for k in range(n):
+                if not seen[k, i, j]:
+                    continue
+                total += weight[k]
+                d = _apart(now, others[k], i, j)
+                if d <= limit:
+                    own += weight[k]
+                elif d > np.float32(1.5) * limit:
+                    off[n_off] = k
+                    n_off += 1
+                    before += frames[k] < 0
+                    after += frames[k] > 0
+            if before == 0 or after == 0:
+                continue
+            best = np.float32(0)
+            for a in range(n_off):
+                ka = off[a]
+                support, earlier, later = np.float32(0), False, False
+                for b in range(n_off):
+                    kb = off[b]
+                    if _apart(others[ka], others[kb], i, j) <= limit:
+                        support += weight[kb]
+                        earlier = earlier or frames[kb] < 0
+                        later = later or frames[kb] > 0
+                if earlier and later:
+                    best = max(best, support)
+            if best > alternative * own:
+                verdict[i, j] = 2
+            elif own == 0:
+                verdict[i, j] = 1
+
+
+def still_plane(now: Plane, neighbours: Sequence[Neighbour], options: MotionOptions | None = None) -> Plane:
+    """Trust (h, w) uint8 that a pixel of `now` (h, w, 3) shows the scene at rest: 255, or low where it moves.
+
+    With neighbours of one side only nothing can be said, and all of it is 255. Exposure is levelled by one gain per
+    neighbour and channel."""
+    options = options or MotionOptions()
+    height, width = now.shape[:2]
+    others, seen, frames = align_neighbours(now, neighbours)
+    if not (frames < 0).any() or not (frames > 0).any():
+        return np.full((height, width), 255, np.uint8)
+    weight = (0.35 + 0.65 * np.minimum(np.abs(frames) / options.slow_frames, 1.0)).astype(np.float32)
+    allowed = tolerance(now, options)
+    verdict = np.empty((height, width), np.uint8)
+    _judge(now, others, seen, frames, weight, allowed, np.float32(options.alternative), verdict)
+    core, body = _solid((verdict == 2).astype(np.uint8), options)
+    still = np.where(verdict == 1, np.uint8(options.doubtful), np.uint8(255))
+    still[body > 0] = options.halo
+    still[core > 0] = options.low
+    return still
+
+
+def align_neighbours(
+    now: Plane, neighbours: Sequence[Neighbour]
+) -> tuple[Plane, NDArray[np.bool_], NDArray[np.float32]]:
+    """Neighbours on the pixels of `now`, levelled to its exposure: (k, h, w, 3), seen (k, h, w), frames (k,)."""
+    height, width = now.shape[:2]
+    others = np.zeros((len(neighbours), height, width, 3), np.uint8)
+    seen = np.zeros((len(neighbours), height, width), bool)
+    frames = np.array([n.frames for n in neighbours], np.float32)
+    sparse = np.s_[::6, ::6]
+    for k, neighbour in enumerate(neighbours):
+        x, y = neighbour.at_px[..., 0], neighbour.at_px[..., 1]
+        last_x, last_y = neighbour.rgb.shape[1] - 1, neighbour.rgb.shape[0] - 1
+        seen[k] = (x >= 0) & (x <= last_x) & (y >= 0) & (y <= last_y)
+        if not seen[k][sparse].any():
+            continue
+        warped = cv2.remap(neighbour.rgb, x, y, cv2.INTER_LINEAR)
+        usable = seen[k][sparse]
+        ratio = (now[sparse][usable] + 4.0) / (warped[sparse][usable] + 4.0)
+        gain = np.clip(np.median(ratio, axis=0), 0.5, 2.0)
+        levels = np.arange(256)[:, None] * gain
+        table = np.clip(np.rint(levels), 0, 255).astype(np.uint8)[:, None, :]
+        others[k] = cv2.LUT(warped, np.ascontiguousarray(table.reshape(1, 256, 3)))
+    return others, seen, frames
+
+
+def _solid(moves: Plane, options: MotionOptions) -> tuple[Plane, Plane]:
+    """Without specks; and the same with holes of bodies closed, widened."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(moves, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= options.min_area_px
+    large[0] = False
+    kept = large[labels].astype(np.uint8)
+    closed = cv2.morphologyEx(kept, cv2.MORPH_CLOSE, _disc(5), borderValue=0)
+    flood = np.pad(closed, 1)
+    cv2.floodFill(flood, None, (0, 0), 2)
+    holes = (flood[1:-1, 1:-1] == 0).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= moves.size // 500  # a ring of players round free grass stays a ring
+    small[0] = False
+    filled = np.maximum(closed, small[labels].astype(np.uint8))
+    return kept, np.asarray(cv2.dilate(filled, _disc(2 * options.grow_px + 1)), np.uint8)
+
+
+def _disc(side: int) -> Plane:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
+
+
+class ScreenFixed:
+    """What stays at its place on the screen while the scene moves, counted over a shot.
+
+    A pixel that agrees with its neighbour in time as it is, and not when the neighbour is moved as the camera moved,
+    votes for a graphic; one that only agrees when moved votes against it; grass agrees both ways and says nothing.
+    """
+
+    def __init__(self, size_px: tuple[int, int], options: MotionOptions | None = None) -> None:
+        self.options = options or MotionOptions()
+        self.fixed: NDArray[np.float32] = np.zeros(size_px[::-1], np.float32)
+        self.told: NDArray[np.float32] = np.zeros(size_px[::-1], np.float32)
+        self.looked: NDArray[np.float32] = np.zeros(size_px[::-1], np.float32)
+        self.n_looks = 0
+
+    def look(self, now: Plane, neighbour: Neighbour, min_shift_px: float = 3.0) -> bool:
+        """Take one pair into account; says whether the camera moved enough between the two to tell."""
+        height, width = now.shape[:2]
+        rest = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+        if np.median(np.abs(neighbour.at_px - rest)[::8, ::8].max(axis=-1)) < min_shift_px:
+            return False
+        moved, seen, _ = align_neighbours(now, [neighbour])
+        allowed = tolerance(now, self.options)
+        as_it_is, as_moved = _difference(now, neighbour.rgb), _difference(now, moved[0])
+        # Where the neighbour does not look, nothing says that the scene would have been different.
+        stays = (as_it_is <= allowed) & (as_moved > 1.5 * allowed) & seen[0]
+        goes = (as_it_is > 1.5 * allowed) & seen[0]
+        self.fixed += stays
+        self.told += stays | goes
+        self.looked += seen[0]
+        self.n_looks += 1
+        return True
+
+    def mask(self, min_looks: int = 5, share: float = 0.7) -> NDArray[np.bool_] | None:
+        """(h, w) bool, True = scene, or None: no graphic, or too few looks to say."""
+        if self.n_looks < min_looks:
+            return None
+        seeds = (self.fixed > share * self.told) & (self.fixed >= np.maximum(4, 0.5 * self.looked))
+        against = self.told - self.fixed > 0.5 * self.told
+        closed = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_CLOSE, _disc(7), borderValue=0)
+        filled = (closed > 0) & (seeds | ~against)
+        found = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
+        large = stats[:, cv2.CC_STAT_AREA] >= 12
+        large[0] = False
+        if not large.any() or large[labels].mean() > 0.3:  # so much of a picture is not a graphic
+            return None
+        return cv2.dilate(large[labels].astype(np.uint8), _disc(2 * self.options.grow_px + 1)) == 0
+
+
+def _difference(a: Plane, b: Plane) -> NDArray[np.float32]:
+    """The measure of _apart for whole pictures."""
+    apart = cv2.absdiff(a, b)
+    return 0.25 * (apart.sum(axis=-1, dtype=np.float32) + apart.max(axis=-1))
