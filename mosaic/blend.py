@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _catmull_rom(t: float) -> tuple[float, float, float, float]:
+def _catmull_rom(t: float) -> Any:
     """Weights of the four neighbours for a position t in 0..1 between the middle two."""
     half, t2 = np.float32(0.5) * t, t * t
     t3 = half * t2  # every constant is float32: one float64 among them halves the speed

@@ -32,8 +32,8 @@ class RegisterOptions:
     only hand on. min_overlap, min_inliers: shares of informative pixels. score_ok, score_weak: largest residual scale
     against that of shifted pictures. cell_floor_px: error of a cell's place that is not noise (crowd, codec;
     real-footage.md 6.3). cell_max_px: directions less certain are dropped. cell_linear_px: residual flow beyond which
-    it is no measurement, found in flow_passes local steps. correlation: variance inflation of a cell, whose residuals are
-    correlated between pixels. kernel: see kernels.py.
+    it is no measurement, found in flow_passes local steps. correlation: variance inflation of a cell, whose residuals
+    are correlated between pixels. kernel: see kernels.py.
     """
 
     max_steps: tuple[int, ...] = (4, 5, 6, 8, 10, 10)

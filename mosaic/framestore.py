@@ -167,13 +167,13 @@ class FrameStore:
         return plane
 
     def _put_trust(self, plane: NDArray[np.uint8]) -> int:
-        digest = hashlib.blake2b(np.ascontiguousarray(plane), digest_size=16).digest()
+        digest = hashlib.blake2b(np.ascontiguousarray(plane).data, digest_size=16).digest()
         if digest not in self._trust_known:
             self._trust_known[digest] = self._append(np.ascontiguousarray(plane))
         return self._trust_known[digest]
 
     def _append(self, array: NDArray[np.uint8]) -> int:
-        offset, view = self._end, memoryview(array).cast("B")
+        offset, view = self._end, array.data.cast("B")
         while view:
             written = os.pwrite(self._file, view, self._end)
             self._end += written
@@ -182,7 +182,7 @@ class FrameStore:
 
     def _read(self, offset: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         array = self._buffer(shape)
-        view = memoryview(array).cast("B")
+        view = array.data.cast("B")
         while view:
             n_bytes = os.preadv(self._file, [view], offset)
             if n_bytes == 0:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numba
@@ -52,23 +53,29 @@ class Neighbour:
     at_px: NDArray[np.float32]
 
 
+@lru_cache(maxsize=16)
+def _hats(n: int, n_nodes: int, step: int) -> NDArray[np.float32]:
+    """Weights (n, n_nodes) of linear interpolation between nodes `step` apart."""
+    return np.maximum(1 - np.abs(np.arange(n)[:, None] / step - np.arange(n_nodes)), 0.0).astype(np.float32)
+
+
 def expand_map(nodes: NDArray[np.float64], step: int, size_px: tuple[int, int]) -> NDArray[np.float32]:
     """A map given at every step-th pixel (rows, columns, 2), one beyond each end, at all pixels (h, w, 2)."""
-
-    def hat(n: int, n_nodes: int) -> NDArray[np.float64]:
-        return np.maximum(1 - np.abs(np.arange(n)[:, None] / step - np.arange(n_nodes)), 0.0)
-
-    across, down = hat(size_px[0], nodes.shape[1]), hat(size_px[1], nodes.shape[0])
-    far = np.where(np.isfinite(nodes), nodes, -1e6)
-    return np.stack([down @ far[..., i] @ across.T for i in (0, 1)], axis=-1).astype(np.float32)
+    across, down = _hats(size_px[0], nodes.shape[1], step), _hats(size_px[1], nodes.shape[0], step)
+    far = np.where(np.isfinite(nodes), nodes, -1e6).astype(np.float32)
+    at = np.empty((size_px[1], size_px[0], 2), np.float32)
+    for i in (0, 1):
+        at[..., i] = down @ (far[..., i] @ across.T)
+    return at
 
 
 def tolerance(rgb: Plane, options: MotionOptions) -> NDArray[np.float32]:
     """Difference (h, w), grey levels, that noise and a slight misregistration explain at each pixel."""
-    contrast = cv2.morphologyEx(rgb, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).mean(
-        axis=-1, dtype=np.float32
-    )
-    return np.float32(options.noise_grey) + np.float32(options.detail) * contrast
+    contrast = cv2.morphologyEx(rgb, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+    mean = cv2.transform(
+        contrast, np.full((1, 3), 1 / 3)
+    )  # numpy's mean over three channels takes ten times as long
+    return np.float32(options.noise_grey) + np.float32(options.detail) * mean.astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -241,7 +248,11 @@ class ScreenFixed:
         return cv2.dilate(large[labels].astype(np.uint8), _disc(2 * self.options.grow_px + 1)) == 0
 
 
-def _difference(a: Plane, b: Plane) -> NDArray[np.float32]:
+@numba.njit(cache=True, nogil=True)
+def _difference(a, b):  # type: ignore[no-untyped-def]
     """The measure of _apart for whole pictures."""
-    apart = cv2.absdiff(a, b)
-    return 0.25 * (apart.sum(axis=-1, dtype=np.float32) + apart.max(axis=-1))
+    out = np.empty(a.shape[:2], np.float32)
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = _apart(a, b, i, j)
+    return out

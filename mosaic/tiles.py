@@ -170,9 +170,7 @@ def _tile_maps(scene: Scene, x0: int, y0: int, width: int, height: int) -> list[
     return [entry[1:] for entry in found]
 
 
-def _ratio(
-    fineness: float, floor: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ratio(fineness: float, floor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Resolution over the floor's, at most 2; and the same fading to 0 from the floor to 15 % below it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.minimum(np.where(floor > 0, fineness / floor, 1.0), 2.0)

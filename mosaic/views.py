@@ -52,7 +52,7 @@ class CompositeOptions:
     memory_bytes: int = 200_000_000
     max_candidates: int = 1200
     gains: bool = True
-    motion_rounds: int = 3
+    motion_rounds: int = 1
 
     def __post_init__(self) -> None:
         if not 1 <= self.views <= self.max_views <= 255:
@@ -267,7 +267,9 @@ def share_views(
     fine = np.array([resolution(p) for p in placements])[:, None] >= 0.85 * rating.floor
     near = np.where((rating.quality == 0) & fine & (reach < 0), np.maximum(1 + reach / cell, 0.0), 0.0)
     shape = (len(placements), ny, nx)
-    coarse = np.where((reach > options.margin_px) & ~fine, np.sqrt(_clipped_ratio(placements, rating.floor)), 0.0)
+    coarse = np.where(
+        (reach > options.margin_px) & ~fine, np.sqrt(_clipped_ratio(placements, rating.floor)), 0.0
+    )
     quality, rare, near = rating.quality.reshape(shape), rating.rare.reshape(shape), near.reshape(shape)
     coarse = coarse.reshape(shape)
     taken = np.zeros(shape, bool)

@@ -22,6 +22,7 @@ EVERY = 6  # frames between pictures kept only to compare with
 # Frames between a picture and its neighbours: in .5 s a runner has left his place, a stroller in 4 s.
 APART = (12, 25, 50, 100)
 REACH = 104
+LOOK_EVERY = 10  # frames between looks for what is stuck to the screen
 SMALL_WIDTH_PX = 480
 STEP_PX = 16  # small px between exact points of a map
 LEAST_OVERLAP = 0.1
@@ -48,6 +49,7 @@ class MovingFinder:
         self._ring: deque[_Small] = deque()
         self._waiting: deque[_Small] = deque()
         self._last_compared = -(10**9)
+        self._last_look = -(10**9)
         self._fixed = ScreenFixed(self._size)
 
     def push(self, frame: int, picture: Callable[[], NDArray[np.uint8]]) -> None:
@@ -79,6 +81,9 @@ class MovingFinder:
             self._ring.popleft()
         neighbours = self._neighbours(now)
         self._store.put_still(now.frame, still_plane(now.rgb, neighbours))
+        if now.frame - self._last_look < LOOK_EVERY:
+            return
+        self._last_look = now.frame
         for side in (-1, 1):  # a pan one way never tells about the border where the scene comes in
             for neighbour in neighbours:
                 if neighbour.frames * side > 0 and self._fixed.look(now.rgb, neighbour):

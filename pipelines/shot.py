@@ -359,7 +359,9 @@ def _second_pass(
     first, last = tracker.observations[0].frame, tracker.observations[-1].frame
     planned = set(plan.frames)
     # Only where frames lie relative to each other counts here: the axes of the reference will do.
-    placed = {p.frame: p for p in placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px)}
+    placed = {
+        p.frame: p for p in placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px)
+    }
     moving = MovingFinder(placed, planned, store)
     retracker = Retracker(
         tracker=tracker,
