@@ -296,7 +296,8 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
     4. weighted mean of the views within 2 min(spread, cap) + floor of the median; the nearest view if none is.
     One view: taken. Two: the one with more votes is the centre.
     Out, uint8: out (N, 3), n_seen (N,), spread (N,), support (N,) = 255 x share of the votes
-    that are near the median.
+    that are near the median, less where fewer than four views of some weight are: one trusted view among distrusted
+    ones is no majority.
     """
     n, _, size = stack.shape
     rows = np.empty((n, _BLOCK), np.uint8)
@@ -304,7 +305,8 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
     apart = np.empty((n, _BLOCK), np.uint8)
     missing = np.empty(_BLOCK, np.uint8)
     median = np.empty(_BLOCK, np.uint8)
-    total = np.empty((6, _BLOCK), np.float32)
+    total = np.empty((7, _BLOCK), np.float32)
+    strongest = np.empty(_BLOCK, np.uint8)
     values = np.empty(n, np.int32)
     votes = np.empty(n, np.float32)
     half = n // 2
@@ -316,10 +318,12 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
         length = min(_BLOCK, size - start)
         stop = start + length
         missing[:] = 0
+        strongest[:] = 0
         for k in range(n):
             seen = vote[k, start:stop]
             for p in range(length):
                 missing[p] += np.uint8(1) if seen[p] == 0 else np.uint8(0)
+                strongest[p] = max(strongest[p], seen[p])
         for c in range(4):
             pads = np.full(_BLOCK, first_pad, np.uint8)
             for k in range(n):
@@ -399,9 +403,12 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
                 total[3, p] += w
                 total[4, p] += np.float32(seen[p]) if near else np.float32(0)
                 total[5, p] += np.float32(seen[p])
+                strong = near & (np.int32(seen[p]) * 8 >= np.int32(strongest[p]))
+                total[6, p] += np.float32(1) if strong else np.float32(0)
         for p in range(length):
             at = start + p
-            support[at] = np.uint8(np.float32(255) * total[4, p] / max(total[5, p], np.float32(1)))
+            share = total[4, p] / max(total[5, p], np.float32(1))
+            support[at] = np.uint8(np.float32(255) * share * min(total[6, p] * np.float32(0.25), np.float32(1)))
             if total[3, p] > 0:
                 for c in range(3):
                     out[at, c] = np.uint8(total[c, p] / total[3, p] + np.float32(0.5))

@@ -122,10 +122,10 @@ def _final_views(
         raise ValueError("no stored frame has a placement: nothing to composite")
     rating = rate_views(stored, lattice, options)
     vote = share_views(stored, rating, lattice, surface.scale_px, options)
-    used = np.flatnonzero(vote.any(axis=(1, 2)) & rating.quality.any(axis=1))
-    if not len(used):
+    if not vote.any():
         raise ValueError(f"none of {len(stored)} stored frames sees the panorama")
-    return tuple(stored[int(i)] for i in used), rating.floor, vote[used]
+    # Also those without a vote: a strip between lattice points may have nobody else.
+    return tuple(stored), rating.floor, vote
 
 
 def solve_gains(

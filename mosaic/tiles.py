@@ -94,14 +94,31 @@ def _tile(
     scene: Scene, x0: int, y0: int, width: int, height: int, local: threading.local
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]] | None:
     """image (h, w, 3), n_seen, spread, support of one tile; None where no view reaches it."""
-    options = scene.options
     maps = scene.maps.get((x0, y0)) if scene.maps is not None else None
     if maps is None:
         maps = _tile_maps(scene, x0, y0, width, height)
         if scene.maps is not None:
             scene.maps[x0, y0] = maps
+    image, n_seen, spread, support = _blended(scene, maps, width, height, local)
+    if (n_seen == 0).any():
+        # The lattice's rules leave out who sees a place too coarsely, or in a strip between its points.
+        others = _fallback_maps(scene, x0, y0, n_seen == 0)
+        if others:
+            empty = n_seen == 0
+            filling = _blended(scene, others, width, height, local)
+            for layer, fill in zip((image, n_seen, spread, support), filling, strict=True):
+                layer[empty] = fill[empty]
+    return (image, n_seen, spread, support) if n_seen.any() else None
+
+
+def _blended(
+    scene: Scene, maps: list[TileMap], width: int, height: int, local: threading.local
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
+    """image (h, w, 3), n_seen, spread, support of the views in `maps` over one tile."""
+    options = scene.options
     if not maps:
-        return None
+        plain = np.zeros((3, height, width), np.uint8)
+        return np.zeros((height, width, 3), np.uint8), plain[0], plain[1], plain[2]
     side, most = options.tile_px, options.max_views
     if not hasattr(local, "stack"):  # one stack per thread, used again for every tile
         local.stack = np.empty(most * 3 * side * side, np.uint8)
@@ -123,6 +140,33 @@ def _tile(
             stack[row], vote[row], weight[row],
         )  # fmt: skip
     return blend_stack(stack, vote, weight, floor=options.floor, cap=options.cap, doubt=options.doubt)
+
+
+def _fallback_maps(scene: Scene, x0: int, y0: int, empty: NDArray[np.bool_]) -> list[TileMap]:
+    """Maps, without regard to the lattice, of views that reach empty pixels (h, w) of a tile: the finest of them."""
+    height, width = empty.shape
+    rays, _ = _tile_rays(scene.surface, x0, y0, width, height, GRID_PX)
+    rows, columns = rays.shape[0] - 1, rays.shape[1] - 1
+    padded = np.zeros((rows * GRID_PX, columns * GRID_PX), bool)
+    padded[:height, :width] = empty
+    wanted = padded.reshape(rows, GRID_PX, columns, GRID_PX).any(axis=(1, 3))
+    short = np.where(wanted, scene.options.views, 0)  # views still wanted per cell
+    found: list[TileMap] = []
+    for index in sorted(range(len(scene.views)), key=lambda i: -resolution(scene.views[i])):
+        placement = scene.views[index]
+        xy = placement.ray_to_pixel(rays)
+        with np.errstate(invalid="ignore"):
+            inside = np.asarray(((xy >= 0) & (xy <= np.array(placement.size_px) - 1)).all(axis=-1))
+        reached = (inside[:-1, :-1] | inside[1:, :-1] | inside[:-1, 1:] | inside[1:, 1:]) & (short > 0)
+        if not reached.any() or len(found) >= scene.options.max_views:
+            continue
+        short = short - reached
+        step, shrink = GRID_PX, _shrink(xy, GRID_PX)
+        grid = np.empty((*xy.shape[:2], 4), np.float32)
+        grid[..., :2] = np.where(np.isfinite(xy), (xy - (shrink - 1) / 2) / shrink, UNSEEN)
+        grid[..., 2:] = 1.0
+        found.append((index, grid, step, shrink))
+    return found
 
 
 def _tile_maps(scene: Scene, x0: int, y0: int, width: int, height: int) -> list[TileMap]:
@@ -157,7 +201,7 @@ def _tile_maps(scene: Scene, x0: int, y0: int, width: int, height: int) -> list[
         grid = np.empty((*xy.shape[:2], 4), np.float32)
         grid[..., :2] = np.where(np.isfinite(xy), (xy - (shrink - 1) / 2) / shrink, UNSEEN)
         # To decide what stands still, who sees it best counts a little; to paint it, the sharp views count most.
-        grid[..., 2] = vote * (0.3 + 0.7 * inside) * ratio**2
+        grid[..., 2] = vote * (0.3 + 0.7 * inside) * np.clip(ratio, 0.25, 2.0)
         grid[..., 3] = member * inside * np.maximum(sharp**4, 0.002 * ratio)
         found.append((float((central * (grid[..., 2] + grid[..., 3])).sum()), int(index), grid, step, shrink))
     if not found:

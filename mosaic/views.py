@@ -12,12 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.surface import Placement, Surface
 
-LEAST_RATIO = 0.25  # of the resolution floor: a view coarser than this does not even vote
+COVER_CELLS = 600  # over the longer side of the surface: how finely coverage is looked at
+LEAST_RATIO = 0.08  # of the resolution floor: a view coarser than this does not even vote
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -354,12 +356,55 @@ def plan_views(
     chosen, count, limit = select_views(rating, candidates, options, min_gap=options.min_gap)
     if not chosen:
         raise ValueError(f"none of {len(candidates)} placements sees the panorama {surface}")
+    chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
     return ViewPlan(
         frames=tuple(sorted(candidates[i].frame for i in chosen)),
         n_views=count.reshape(len(lattice.y_px), len(lattice.x_px)),
         n_candidates=len(candidates),
         limit=limit,
     )
+
+
+def _cover_rest(
+    placements: Sequence[Placement], chosen: Sequence[int], surface: Surface, limit: int
+) -> list[int]:
+    """Further placements, `limit` at most, that see what none of the chosen ones does: strips between lattice points,
+    and what only a coarse or blurred frame reaches."""
+    step = max(surface.width, surface.height) / COVER_CELLS
+    shape = (int(np.ceil(surface.height / step)), int(np.ceil(surface.width / step)))
+    covered = np.zeros(shape, np.uint8)
+    for i in chosen:
+        _draw_outline(covered, placements[i], surface, step)
+    taken = set(chosen)
+    gains: list[tuple[int, NDArray[np.intp]]] = []
+    for i, placement in enumerate(placements):
+        if i not in taken:
+            own = np.zeros(shape, np.uint8)
+            _draw_outline(own, placement, surface, step)
+            new = np.flatnonzero((own > covered).ravel())
+            if len(new):
+                gains.append((i, new))
+    added: list[int] = []
+    open_cells = covered.ravel() == 0
+    while gains and len(added) < limit:
+        counts = [int(open_cells[cells].sum()) for _, cells in gains]
+        best = int(np.argmax(counts))
+        if counts[best] == 0:
+            break
+        added.append(gains[best][0])
+        open_cells[gains[best][1]] = False
+    return added
+
+
+def _draw_outline(cells: NDArray[np.uint8], placement: Placement, surface: Surface, step: float) -> None:
+    """Set the cells, `step` panorama px wide, that a frame covers; none where its border leaves the surface."""
+    width, height = placement.size_px
+    u = np.linspace(0, 1, 9)[:-1]
+    zero, one = np.zeros_like(u), np.ones_like(u)
+    border = np.concatenate([np.stack(p, axis=-1) for p in ((u, zero), (one, u), (1 - u, one), (zero, 1 - u))])
+    at = surface.ray_to_pixel(placement.pixel_to_ray(border * [width - 1.0, height - 1.0])) / step
+    if np.isfinite(at).all():
+        cv2.fillPoly(cells, [np.rint(at - 0.5).astype(np.int32)], 1)
 
 
 def frame_limit(quality: NDArray[np.float32], options: CompositeOptions) -> int:

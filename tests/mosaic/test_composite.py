@@ -383,3 +383,18 @@ def test_one_long_look_does_not_outvote_three_short_ones(tmp_path):
     where = np.s_[y - 8 : y + 8, x - 4 : x + 4]
     assert panorama.n_seen[where].min() >= 17
     assert np.abs(panorama.image[where] - clean_plate(surface)[where]).mean() < 3
+
+
+def test_every_pixel_that_a_frame_saw_is_filled(tmp_path):
+    # One wide glance over the whole, then a long look at the middle at three times the zoom.
+    wide = [Pinhole(frame=0, f_px=150.0, size_px=(240, 136))]
+    close = [Pinhole(frame=10 + 3 * k, f_px=450.0, size_px=(240, 136), pan_deg=0.1 * k) for k in range(40)]
+    frames = [*wide, *close]
+    surface = choose_surface(frames, "cylindrical")
+    assert 0 in plan_views(frames, surface).frames
+    panorama = composite_of(tmp_path, frames, surface)
+    xy = np.stack(np.meshgrid(np.arange(surface.width), np.arange(surface.height)), axis=-1)
+    at = wide[0].ray_to_pixel(surface.pixel_to_ray(xy))
+    seen = ((at >= 4) & (at <= np.array(wide[0].size_px) - 5)).all(axis=-1)
+    assert seen.mean() > 0.5 and (panorama.alpha[seen] == 255).all()
+    assert psnr(panorama.image, clean_plate(surface), seen) > 25
