@@ -408,7 +408,9 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
         for p in range(length):
             at = start + p
             share = total[4, p] / max(total[5, p], np.float32(1))
-            support[at] = np.uint8(np.float32(255) * share * min(total[6, p] * np.float32(0.25), np.float32(1)))
+            support[at] = np.uint8(
+                np.float32(255) * share * min(total[6, p] * np.float32(0.25), np.float32(1))
+            )
             if total[3, p] > 0:
                 for c in range(3):
                     out[at, c] = np.uint8(total[c, p] / total[3, p] + np.float32(0.5))

@@ -401,7 +401,9 @@ def _draw_outline(cells: NDArray[np.uint8], placement: Placement, surface: Surfa
     width, height = placement.size_px
     u = np.linspace(0, 1, 9)[:-1]
     zero, one = np.zeros_like(u), np.ones_like(u)
-    border = np.concatenate([np.stack(p, axis=-1) for p in ((u, zero), (one, u), (1 - u, one), (zero, 1 - u))])
+    border = np.concatenate(
+        [np.stack(p, axis=-1) for p in ((u, zero), (one, u), (1 - u, one), (zero, 1 - u))]
+    )
     at = surface.ray_to_pixel(placement.pixel_to_ray(border * [width - 1.0, height - 1.0])) / step
     if np.isfinite(at).all():
         cv2.fillPoly(cells, [np.rint(at - 0.5).astype(np.int32)], 1)
