@@ -54,7 +54,7 @@ class CompositeOptions:
     memory_bytes: int = 200_000_000
     max_candidates: int = 1200
     gains: bool = True
-    motion_rounds: int = 1
+    motion_rounds: int = 2
 
     def __post_init__(self) -> None:
         if not 1 <= self.views <= self.max_views <= 255:
