@@ -3,10 +3,11 @@
     python -m benchmarks.clean_plate [--seeds 7 12] [--players 0.10 0.25] [--frames 160] [--out FOLDER] [--reuse]
 
 PSNR (dB) of the panorama where anything was seen, where players passed, where they passed and at least FIVE of the
-frames used show the ground, and elsewhere. One gain per channel is taken off (exposure is not the question). Twice: `aligned`,
-where each panorama pixel is followed back through the frames that made it to the ray that it truly shows, so that a
-wrong focal length does not count; and `placed`, with nothing but the world's rotation at the reference frame taken off.
-`left` is the share of those five-view pixels that differ from the truth by more than 60 grey levels: visible remains.
+frames used show the ground, and elsewhere. One gain per channel is taken off (exposure is not the question). Twice:
+`aligned`, where each panorama pixel is followed back through the frames that made it to the ray that it truly shows,
+so that a wrong focal length does not count; and `placed`, with nothing but the world's rotation at the reference frame
+taken off. `left` is the share of those five-view pixels that differ from the truth by more than 60 grey levels:
+visible remains.
 With --out the panoramas and error pictures stay there as PNG; --reuse measures runs that are there already.
 """
 
@@ -82,8 +83,12 @@ def true_picture(clip: SynthClip, run: Path) -> Truth:
         known = np.isfinite(at).all(axis=-1)
         at = np.where(known[..., None], at, -1e5)
         off = np.abs(at / [(width - 1) / 2, (height - 1) / 2] - 1).max(axis=-1)
-        share = np.where(off < 1.1, (1.1 - off) ** 2, 0.0)  # the frame in whose middle a pixel lies tells best
-        rays += share[..., None] * np.nan_to_num(clip.camera(k).pixel_to_ray(np.where(off[..., None] < 1.1, at, 0.0)))
+        share = np.where(
+            off < 1.1, (1.1 - off) ** 2, 0.0
+        )  # the frame in whose middle a pixel lies tells best
+        rays += share[..., None] * np.nan_to_num(
+            clip.camera(k).pixel_to_ray(np.where(off[..., None] < 1.1, at, 0.0))
+        )
         weight += share
         xy = _expanded(at, shape)
         last = np.array([width, height]) - 1 - BORDER_PX
@@ -94,7 +99,10 @@ def true_picture(clip: SynthClip, run: Path) -> Truth:
     mean = _expanded(rays / np.maximum(weight, 1e-9)[..., None], shape)
     reference = int(read_run(run).shots[0].reference_frame)
     turn = clip.camera(reference).R_cam_world.T @ placed[reference].pose.R
-    plain = surface.pixel_to_ray(np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)) @ turn.T
+    plain = (
+        surface.pixel_to_ray(np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1))
+        @ turn.T
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
         aligned = clip.renderer.sample_environment(mean, surface.scale_px)
         return Truth(
@@ -156,7 +164,9 @@ def measure(image: NDArray[np.uint8], seen: Mask, truth: Truth) -> dict[str, dic
 
 
 def _psnr(error: Image) -> float:
-    return float(10 * np.log10(255**2 / np.mean(error.astype(np.float64) ** 2))) if len(error) else float("nan")
+    return (
+        float(10 * np.log10(255**2 / np.mean(error.astype(np.float64) ** 2))) if len(error) else float("nan")
+    )
 
 
 def run_one(spec: ClipSpec, folder: Path, reuse: bool) -> dict[str, dict[str, float]]:
@@ -180,7 +190,9 @@ def run_one(spec: ClipSpec, folder: Path, reuse: bool) -> dict[str, dict[str, fl
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[7, 8])
     parser.add_argument("--players", type=float, nargs="+", default=[0.10, 0.25])
     parser.add_argument("--frames", type=int, default=160)
@@ -194,7 +206,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 folder = (chosen.out or Path(scratch)) / f"{seed}-{round(100 * players)}"
                 result = run_one(clip_spec(seed, players, chosen.frames), folder, chosen.reuse)
                 for way, figures in result.items():
-                    values = [format(figures[name], ".2f" if name == "left %" else ".1f") for name in COLUMNS[3:]]
+                    values = [
+                        format(figures[name], ".2f" if name == "left %" else ".1f") for name in COLUMNS[3:]
+                    ]
                     print("| " + " | ".join([str(seed), f"{players:.0%}", way, *values]) + " |", flush=True)
 
 
