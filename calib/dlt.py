@@ -2,6 +2,7 @@
 
 The DLT starts things; `fit` is the estimator to report: Gauss-Newton on the transfer error (noise in b, or in both:
 Sampson's first-order weights), Huber weights, covariance of h. Source: calibration.md 3; Hartley and Zisserman 4.
+Other estimators, each with a covariance, are in homography_fit.py.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ def square_root_information(info: ArrayLike) -> Array:
     )
 
 
-def _normalisation(points: Array, weight: Array) -> tuple[Array, Array]:
+def normalisation(points: Array, weight: Array) -> tuple[Array, Array]:
+    """T (..., 3, 3) and T points (..., m, 2): centroid 0, mean distance sqrt 2 (Hartley), weights (..., m)."""
     total = np.maximum(weight.sum(-1), 1e-300)
     centre = (points * weight[..., None]).sum(-2) / total[..., None]
     distance = np.linalg.norm(points - centre[..., None, :], axis=-1)
@@ -50,8 +52,8 @@ def dlt(points_a_px: ArrayLike, points_b_px: ArrayLike, root_info: ArrayLike | N
     S = np.broadcast_to(S, (*a.shape, 2))
     weight = (np.abs(S).sum((-1, -2)) > 0) & np.isfinite(a).all(-1) & np.isfinite(b).all(-1)
     a, b = np.where(weight[..., None], a, 0.0), np.where(weight[..., None], b, 0.0)
-    Ta, x = _normalisation(a, weight.astype(float))
-    Tb, u = _normalisation(b, weight.astype(float))
+    Ta, x = normalisation(a, weight.astype(float))
+    Tb, u = normalisation(b, weight.astype(float))
     rows = np.zeros((*a.shape[:-1], 2, 9))
     ones = np.concatenate([x, np.ones((*x.shape[:-1], 1))], -1)
     rows[..., 0, 0:3], rows[..., 1, 3:6] = ones, ones
@@ -104,8 +106,8 @@ def fit(
     if not np.isfinite(H).all():
         return nothing
     ones = np.ones(len(a))
-    Ta, x = _normalisation(a, ones)
-    Tb, u = _normalisation(b, ones)
+    Ta, x = normalisation(a, ones)
+    Tb, u = normalisation(b, ones)
     h = np.ravel(Tb @ H @ np.linalg.inv(Ta))
     h = h / np.linalg.norm(h)
     weights, step, normal, basis, chi2 = ones, 0, np.eye(8), np.zeros((9, 8)), np.nan
@@ -138,16 +140,23 @@ def fit(
         if delta @ normal @ delta < 1e-10:
             converged = True
             break
-    raw = np.linalg.inv(Tb) @ h.reshape(3, 3) @ Ta
-    map9 = np.kron(np.linalg.inv(Tb), Ta.T)
+    H, cov = to_pixels(h, basis @ np.linalg.inv(normal) @ basis.T, Ta, Tb)
+    return HomographyFit(
+        H=H, cov=cov, chi2=chi2, dof=2 * len(a) - 8, weights=weights, n_steps=step, converged=converged
+    )
+
+
+def to_pixels(h: Array, cov: Array, T_a: Array, T_b: Array) -> tuple[Array, Array]:
+    """H (3, 3), det 1, in px and its covariance (9, 9) from the unit 9-vector h of normalised points and its own.
+
+    T_a, T_b (3, 3): px to normalised coordinates of either view. First order.
+    """
+    raw = np.linalg.inv(T_b) @ h.reshape(3, 3) @ T_a
+    map9 = np.kron(np.linalg.inv(T_b), T_a.T)
     scale = 1 / np.cbrt(np.linalg.det(raw))
-    H = raw * scale
     # det-1 gauge: the component of an error along H itself is removed.
     gradient = scale * map9
     inverse_t = np.linalg.inv(raw).T.ravel()
     gauge = np.eye(9) - np.outer(raw.ravel(), inverse_t) / 3
     full = gauge @ gradient
-    cov = full @ basis @ np.linalg.inv(normal) @ basis.T @ full.T
-    return HomographyFit(
-        H=H, cov=cov, chi2=chi2, dof=2 * len(a) - 8, weights=weights, n_steps=step, converged=converged
-    )
+    return raw * scale, full @ cov @ full.T
