@@ -1,11 +1,11 @@
-"""The command line: run, demo, probe, compare. Exit codes, one-line errors, progress and logging live here only.
+"""The command line: run, demo, probe, compare; more commands are in cli_results.py. Exit codes, one-line errors,
+progress and logging live here only.
 
 Nothing heavy is imported before a command needs it: --help answers without torch, cv2, scipy, av or numpy.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import sys
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipelines.cli_results import complete_names, format_names, print_json, register
 from pipelines.errors import (
     EXIT_INTERRUPTED,
     EXIT_OK,
@@ -86,7 +87,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _fail(line: str, error: Mapping[str, str], as_json: bool, code: int = EXIT_USAGE) -> int:
     print(f"broadcast-mosaic: {line}", file=sys.stderr)
     if as_json:
-        _print_json({"exit_code": code, "error": dict(error)})
+        print_json({"exit_code": code, "error": dict(error)})
     return code
 
 
@@ -109,10 +110,17 @@ def _split_settings(args: Sequence[str]) -> tuple[list[str], list[str]]:
     return plain, dotted
 
 
-def _settings(context: typer.Context, path: Path | None) -> Config:
+def _settings(context: typer.Context, path: Path | None, exports: str = "") -> Config:
     from pipelines.config import load_config, parse_overrides
+    from pipelines.exports.formats import format_named
 
-    return load_config(path, parse_overrides(context.obj or []))
+    overrides = parse_overrides(context.obj or [])
+    if exports:
+        overrides["output.exports"] = ",".join(format_names(exports))
+    settings = load_config(path, overrides)
+    for name in settings.output.exports:
+        format_named(name).check()  # a missing extra shows now, not after the hours that a run may take
+    return settings
 
 
 def _show_settings(value: bool) -> None:
@@ -162,6 +170,13 @@ def run(
     clips: Clips,
     out: Out,
     config: ConfigFile = None,
+    export: Annotated[
+        str,
+        typer.Option(
+            help="Exports beside the results, with commas: colmap,usd,chan; `export --help` lists them.",
+            autocompletion=complete_names,
+        ),
+    ] = "",
     resume: Resume = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -169,7 +184,7 @@ def run(
     help_config: HelpConfig = False,
 ) -> int:
     """Camera track, homographies, panorama and report of one clip, or of many (a folder each)."""
-    settings = _settings(context, config)
+    settings = _settings(context, config, export)
     _set_up_logging(quiet, verbose)
     if len(clips) == 1:
         result = _run_one(clips[0], out, settings, resume, quiet)
@@ -201,7 +216,7 @@ def demo(
     comparison = compare_run(out, truth)
     code = _report([result], False, quiet or as_json)
     if as_json:
-        _print_json({"exit_code": code, "clips": [_as_document(result)], "comparison": comparison})
+        print_json({"exit_code": code, "clips": [_as_document(result)], "comparison": comparison})
     elif not quiet:
         print(f"\ntruth ({truth}) against estimate:\n{comparison_table(comparison)}")
     return code
@@ -277,7 +292,7 @@ def exit_code(results: Sequence[Mapping[str, Any]]) -> int:
 def _report(results: Sequence[Mapping[str, Any]], as_json: bool, quiet: bool) -> int:
     code = exit_code(results)
     if as_json:
-        _print_json({"exit_code": code, "clips": [_as_document(result) for result in results]})
+        print_json({"exit_code": code, "clips": [_as_document(result) for result in results]})
         return code
     for result in results:
         record = result["record"]
@@ -338,7 +353,7 @@ def _probe(
     with TerminalProgress(show=not quiet) as progress:
         facts = probe(clip, settings, shots=shots, seconds=seconds or None, progress=progress)
     if as_json:
-        _print_json({"exit_code": EXIT_OK, **facts})
+        print_json({"exit_code": EXIT_OK, **facts})
     else:
         print(probe_text(facts))
     return EXIT_OK
@@ -358,11 +373,13 @@ def _compare(
 
     comparison = compare_run(out, truth)
     if as_json:
-        _print_json({"exit_code": EXIT_OK, **comparison})
+        print_json({"exit_code": EXIT_OK, **comparison})
     else:
         print(comparison_table(comparison))
     return EXIT_OK
 
+
+register(app)
 
 # ---- output
 
@@ -385,12 +402,6 @@ def _set_up_logging(quiet: bool, verbose: bool) -> None:
     root.addHandler(handler)
     for package in ("mosaic", "calib", "pipelines"):
         logging.getLogger(package).setLevel(level)
-
-
-def _print_json(document: Mapping[str, Any]) -> None:
-    from pipelines.archive import to_json
-
-    print(json.dumps(to_json(document), indent=2, ensure_ascii=False, allow_nan=False))
 
 
 if __name__ == "__main__":

@@ -12,9 +12,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from pipelines.errors import ConfigError
+from pipelines.exports import formats
 
 
 class Section(BaseModel):
@@ -280,6 +281,19 @@ class OutputOptions(Section):
         le=65500,
         description=("px; widest panorama.jpg: many viewers stop at 16384, the format itself at 65500"),
     )
+    exports: tuple[str, ...] = Field(
+        default=(),
+        description=(
+            f"exports beside each shot's panorama, names with commas between; of {', '.join(formats.NAMES)}"
+        ),
+    )
+
+    @field_validator("exports", mode="before")
+    @classmethod
+    def _names(cls, value: Any) -> Any:
+        if value is None:
+            return ()
+        return formats.parse_names(value) if isinstance(value, str | list | tuple) else value
 
 
 class RunOptions(Section):

@@ -42,6 +42,7 @@ NOT_IN_DIGEST = (
     ("decode", "threads"),
     ("decode", "queue_frames"),
     ("output", "parquet"),
+    ("output", "exports"),
 )
 
 
@@ -151,8 +152,9 @@ class OutputFolder:
         for name in stale:
             (self.out / name).unlink(missing_ok=True)
             folder = (self.out / name).parent
-            if folder != self.out and folder.is_dir() and not any(folder.iterdir()):
+            while folder != self.out and folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
+                folder = folder.parent
 
     def _release(self) -> None:
         if self._lock is not None:

@@ -26,6 +26,7 @@ from pipelines.archive import program_version
 from pipelines.config import Config
 from pipelines.decode import Clip, Frame, open_clip
 from pipelines.errors import InputError
+from pipelines.exports.exporter import export_for_run
 from pipelines.keyframe_graph import KeyframeImages
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.overlays import OverlayFinder
@@ -116,6 +117,7 @@ def process(
         folder.write_camera(table, parquet=config.output.parquet)
         job.timings.seconds["total"] = time.perf_counter() - started
         record = _record(job, opened)
+        export_for_run(record, table, config.output.exports, folder.staging)
         with job.timings.measure("report"):
             write_report(folder.staging, record, table, job.thumbnails)
         folder.publish(record)
