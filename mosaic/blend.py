@@ -219,13 +219,20 @@ def median_network(n: int) -> NDArray[np.int32]:
     return network
 
 
+@lru_cache(maxsize=64)
+def median_networks(n: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """median_network of 0, 1 ... n values one after the other (m, 2), and where each begins (n + 2,)."""
+    networks = [median_network(count) if count else np.zeros((0, 2), np.int32) for count in range(n + 1)]
+    return np.concatenate(networks), np.cumsum([0, *(len(network) for network in networks)])
+
+
 _BLOCK = 256  # pixels sorted side by side: 48 views x 256 bytes stay in the first-level cache
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _sort(rows, network):  # type: ignore[no-untyped-def]
-    for m in range(len(network)):
-        a, b = rows[network[m, 0]], rows[network[m, 1]]
+def _sort(rows, networks, first, last):  # type: ignore[no-untyped-def]
+    for m in range(first, last):
+        a, b = rows[networks[m, 0]], rows[networks[m, 1]]
         for p in range(len(a)):
             x, y = a[p], b[p]
             a[p] = x if x < y else y
@@ -265,33 +272,31 @@ def _weighted_median(values, weights, n):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _densest(stack, votes, at, n, reach):  # type: ignore[no-untyped-def]
-    """The view whose colour most votes are near: sum of votes x (1 - distance / reach). Against the median by votes:
-    .8, .7, -.1 dB where players passed (three generator clips of 120 frames with 20 % players)."""
+def _densest(colour, votes, n, reach):  # type: ignore[no-untyped-def]
+    """The view of n whose colour (3, n) most votes are near: sum of votes x (1 - distance / reach). Against the median
+    by votes: .8, .7, -.1 dB where players passed (three generator clips of 120 frames with 20 % players)."""
     best, most = 0, np.float32(-1)
     for k in range(n):
-        if votes[k] == 0:
-            continue
-        r, g, b = np.int32(stack[k, 0, at]), np.int32(stack[k, 1, at]), np.int32(stack[k, 2, at])
+        r, g, b = colour[0, k], colour[1, k], colour[2, k]
         total = np.float32(0)
         for j in range(n):
-            d = abs(r - stack[j, 0, at]) + 2 * abs(g - stack[j, 1, at]) + abs(b - stack[j, 2, at])
-            total += votes[j] * max(reach - np.float32(d), np.float32(0))
+            d = abs(r - colour[0, j]) + np.float32(2) * abs(g - colour[1, j]) + abs(b - colour[2, j])
+            total += votes[j] * max(reach - d, np.float32(0))
         if total > most:
             best, most = k, total
     return best
 
 
 @numba.njit(cache=True, nogil=True)
-def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, spread, support):  # type: ignore[no-untyped-def]
+def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n_seen, spread, support):  # type: ignore[no-untyped-def]
     """One colour a pixel from n views.
 
-    stack (n, 3, N), vote (n, N), weight (n, N) uint8 as sample_view gives them; network = median_network(n).
+    stack (n, 3, N), vote (n, N), weight (n, N) uint8 as sample_view gives them; networks, begin = median_networks(n).
     1. median per channel over the views that see the pixel (a missing one is padded with 0 and 255 in turn);
     2. distance d of each view to it (mean of channels, green twice), spread = 1.4826 median d;
     3. where spread > doubt (grey levels), or where 40 % of the votes are not near the median: instead the colour
        that most votes are near, because then it matters who votes (one moment seen many times, parallax, half-trusted
-       views), and a ground that is always the same is denser than what passes over it. Costs 10 times the plain
+       views), and a ground that is always the same is denser than what passes over it. Costs several times the plain
        median, hence only there;
     4. weighted mean of the views within 2 min(spread, cap) + floor of the median; the nearest view if none is.
     One view: taken. Two: the one with more votes is the centre.
@@ -299,43 +304,60 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
     that are near the median, less where fewer than four views of some weight are: one trusted view among distrusted
     ones is no majority.
     """
-    n, _, size = stack.shape
-    rows = np.empty((n, _BLOCK), np.uint8)
+    n_views, _, size = stack.shape
+    rows = np.empty((n_views, _BLOCK), np.uint8)
     centre = np.empty((3, _BLOCK), np.uint8)
-    apart = np.empty((n, _BLOCK), np.uint8)
+    apart = np.empty((n_views, _BLOCK), np.uint8)
     missing = np.empty(_BLOCK, np.uint8)
     median = np.empty(_BLOCK, np.uint8)
+    pads = np.empty(_BLOCK, np.uint8)
     total = np.empty((7, _BLOCK), np.float32)
     strongest = np.empty(_BLOCK, np.uint8)
-    values = np.empty(n, np.int32)
-    votes = np.empty(n, np.float32)
-    half = n // 2
+    present = np.empty(n_views, np.int64)  # views that see anything of the block: half of a tile's, usually
+    who = np.empty(n_views, np.int64)  # of these, the ones that see the pixel
+    colour = np.empty((3, n_views), np.float32)
+    values = np.empty(n_views, np.int32)
+    votes = np.empty(n_views, np.float32)
     reach = np.float32(4 * 20)  # distances here are sums of four
-    first_pad = np.uint8(
-        n % 2
-    )  # odd n: the first pad goes high, even n: low, so that the rank stays the middle
     for start in range(0, size, _BLOCK):
         length = min(_BLOCK, size - start)
         stop = start + length
+        n = 0
         missing[:] = 0
         strongest[:] = 0
-        for k in range(n):
+        for k in range(n_views):
             seen = vote[k, start:stop]
+            most = np.uint8(0)
+            for p in range(length):
+                most = max(most, seen[p])
+            if most == 0:
+                continue
+            present[n] = k
+            n += 1
             for p in range(length):
                 missing[p] += np.uint8(1) if seen[p] == 0 else np.uint8(0)
                 strongest[p] = max(strongest[p], seen[p])
+        if n == 0:
+            out[start:stop] = 0
+            n_seen[start:stop] = 0
+            spread[start:stop] = 0
+            support[start:stop] = 0
+            continue
+        half = n // 2
+        # Odd n: the first pad goes high, even n: low, so that the rank stays the middle.
+        first_pad = np.uint8(n % 2)
         for c in range(4):
-            pads = np.full(_BLOCK, first_pad, np.uint8)
-            for k in range(n):
-                row = rows[k]
-                source = stack[k, c, start:stop] if c < 3 else apart[k, :length]
-                seen = vote[k, start:stop]
+            pads[:] = first_pad
+            for i in range(n):
+                row = rows[i]
+                source = stack[present[i], c, start:stop] if c < 3 else apart[i, :length]
+                seen = vote[present[i], start:stop]
                 for p in range(length):
                     absent = np.uint8(1) if seen[p] == 0 else np.uint8(0)
                     pad = np.uint8(255) if pads[p] & np.uint8(1) else np.uint8(0)
                     row[p] = pad if absent else source[p]
                     pads[p] += absent
-            _sort(rows, network)
+            _sort(rows, networks, begin[n], begin[n + 1])
             if c < 3:
                 for p in range(length):
                     centre[c, p] = rows[half, p]
@@ -343,17 +365,18 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
                 for p in range(length):
                     median[p] = rows[half, p]
             if c == 2:
-                for k in range(n):
+                for i in range(n):
+                    k = present[i]
                     r, g, b = stack[k, 0, start:stop], stack[k, 1, start:stop], stack[k, 2, start:stop]
                     for p in range(length):
-                        apart[k, p] = _distance(r[p], g[p], b[p], centre[0, p], centre[1, p], centre[2, p])
+                        apart[i, p] = _distance(r[p], g[p], b[p], centre[0, p], centre[1, p], centre[2, p])
         total[:] = 0
-        for k in range(n):
-            seen = vote[k, start:stop]
+        for i in range(n):
+            seen = vote[present[i], start:stop]
             for p in range(length):
                 w = np.float32(seen[p])
                 limit = np.float32(2) * min(np.float32(1.4826) * median[p], cap) + floor
-                total[0, p] += w if apart[k, p] <= limit else np.float32(0)
+                total[0, p] += w if apart[i, p] <= limit else np.float32(0)
                 total[1, p] += w
         # Where the plain median may not be the right one: few views, disagreement, votes against it.
         for p in range(length):
@@ -367,17 +390,24 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
             if count == 0:
                 spread[at] = 0
                 continue
-            best = 0
-            for k in range(n):
-                votes[k] = vote[k, at]
-                if vote[k, at] > vote[best, at]:
-                    best = k
+            m, best = 0, 0
+            for i in range(n):
+                k = present[i]
+                if vote[k, at] == 0:
+                    continue
+                who[m], votes[m] = i, vote[k, at]
+                for c in range(3):
+                    colour[c, m] = stack[k, c, at]
+                if votes[m] > votes[best]:
+                    best = m
+                m += 1
             if count > 2:
-                best = _densest(stack, votes, at, n, reach)
+                best = _densest(colour, votes, m, reach)
             for c in range(3):
-                centre[c, p] = stack[best, c, at]
-            for k in range(n):
-                apart[k, p] = _distance(
+                centre[c, p] = np.uint8(colour[c, best])
+            for j in range(m):
+                k = present[who[j]]
+                d = _distance(
                     stack[k, 0, at],
                     stack[k, 1, at],
                     stack[k, 2, at],
@@ -385,17 +415,19 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
                     centre[1, p],
                     centre[2, p],
                 )
-                values[k] = apart[k, p]
+                apart[who[j], p] = d
+                values[j] = d
             # Two views have no spread of their own: they count as one place when they differ by noise only.
-            median[p] = _weighted_median(values, votes, n) if count > 2 else 0
+            median[p] = _weighted_median(values, votes, m) if count > 2 else 0
             spread[at] = np.uint8(min(np.float32(1.4826) * median[p] + np.float32(0.5), np.float32(255)))
         total[:] = 0
-        for k in range(n):
+        for i in range(n):
+            k = present[i]
             r, g, b = stack[k, 0, start:stop], stack[k, 1, start:stop], stack[k, 2, start:stop]
             seen, share = vote[k, start:stop], weight[k, start:stop]
             for p in range(length):
                 limit = np.float32(2) * min(np.float32(1.4826) * median[p], cap) + floor
-                near = (seen[p] > 0) & (apart[k, p] <= limit)
+                near = (seen[p] > 0) & (apart[i, p] <= limit)
                 w = np.float32(share[p]) if near else np.float32(0)
                 total[0, p] += w * r[p]
                 total[1, p] += w * g[p]
@@ -415,12 +447,12 @@ def robust_value(stack, vote, weight, network, floor, cap, doubt, out, n_seen, s
                 for c in range(3):
                     out[at, c] = np.uint8(total[c, p] / total[3, p] + np.float32(0.5))
             elif missing[p] < n:
-                best = -1
-                for k in range(n):
-                    if vote[k, at] > 0 and (best < 0 or apart[k, p] < apart[best, p]):
-                        best = k
+                nearest = -1
+                for i in range(n):
+                    if vote[present[i], at] > 0 and (nearest < 0 or apart[i, p] < apart[nearest, p]):
+                        nearest = i
                 for c in range(3):
-                    out[at, c] = stack[best, c, at]
+                    out[at, c] = stack[present[nearest], c, at]
             else:
                 for c in range(3):
                     out[at, c] = 0
@@ -447,7 +479,7 @@ def blend_stack(
     spread: NDArray[Any] = np.empty(height * width, np.uint8)
     support: NDArray[Any] = np.empty(height * width, np.uint8)
     robust_value(
-        stack.reshape(n, 3, -1), vote.reshape(n, -1), weight.reshape(n, -1), median_network(n),
+        stack.reshape(n, 3, -1), vote.reshape(n, -1), weight.reshape(n, -1), *median_networks(n),
         np.float32(floor), np.float32(cap), np.float32(doubt), image, n_seen, spread, support,
     )  # fmt: skip
     plane = (height, width)

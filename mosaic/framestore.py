@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -34,6 +34,19 @@ class StoredFrame:
     rgb: NDArray[np.uint8]
     trust: NDArray[np.uint8] | None
     shrink: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Trust:
+    """What was made of a mask: where its trust plane lies in the file and its coarse picture, None = 255 all over."""
+
+    mask: NDArray[np.bool_] | None
+    offset: int | None
+    coarse: NDArray[np.uint8] | None
+
+
+def _equal(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
 
 
 class FrameStore:
@@ -63,13 +76,14 @@ class FrameStore:
         self._trust_of: dict[int, int] = {}  # frame -> offset of its trust plane
         self._trust_known: dict[bytes, int] = {}  # digest -> offset: a static overlay is stored once
         self._trust_kept: tuple[int, NDArray[np.uint8]] | None = None
-        self._last_mask: tuple[NDArray[np.bool_], NDArray[np.uint8]] | None = None
+        self._same: _Trust | None = None  # of the frame before: masks seldom change
         self._coarse: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
         self._cache: OrderedDict[tuple[int, int], StoredFrame] = OrderedDict()
         self._cached_bytes = 0
         self._spare: list[NDArray[np.uint8]] = []
         self._still: dict[int, NDArray[np.uint8]] = {}
         self._screen: NDArray[np.bool_] | None = None
+        self._loading: dict[tuple[int, int], threading.Event] = {}
         self._lock = threading.Lock()
 
     @property
@@ -102,16 +116,22 @@ class FrameStore:
             raise ValueError(f"frame {frame} is {rgb.dtype} {rgb.shape}, need uint8 {(height, width, 3)}")
         if frame in self._offset:
             raise ValueError(f"frame {frame} is stored already")
-        plane = self._trust_plane(mask, trust)
         coarse_size = (width // COARSE, height // COARSE)
         cut = np.s_[: coarse_size[1] * COARSE, : coarse_size[0] * COARSE]
         coarse = cv2.resize(rgb[cut], coarse_size, interpolation=cv2.INTER_AREA)
-        if plane is None:
-            coarse_trust = np.full(coarse_size[::-1], 255, np.uint8)
+        if trust is not None or self._same is None or not _equal(self._same.mask, mask):
+            plane = self._trust_plane(mask, trust)
+            same = _Trust(mask=None if mask is None else mask.copy(), offset=None, coarse=None)
+            if plane is not None:
+                blocks = plane[cut].reshape(coarse_size[1], COARSE, coarse_size[0], COARSE)
+                # A block with any masked pixel is not a measurement.
+                same = replace(same, offset=self._put_trust(plane), coarse=blocks.min(axis=(1, 3)))
+            self._same = same if trust is None else None
         else:
-            blocks = plane[cut].reshape(coarse_size[1], COARSE, coarse_size[0], COARSE)
-            coarse_trust = blocks.min(axis=(1, 3))  # a block with any masked pixel is not a measurement
-            self._trust_of[frame] = self._put_trust(plane)
+            same = self._same
+        if same.offset is not None:
+            self._trust_of[frame] = same.offset
+        coarse_trust = np.full(coarse_size[::-1], 255, np.uint8) if same.coarse is None else same.coarse
         self._coarse[frame] = (np.asarray(coarse, dtype=np.uint8), coarse_trust)
         self._offset[frame] = self._append(np.ascontiguousarray(rgb))
 
@@ -147,15 +167,13 @@ class FrameStore:
         if mask is not None:
             if mask.shape != shape or mask.dtype != np.bool_:
                 raise ValueError(f"mask is {mask.dtype} {mask.shape}, need bool {shape}")
-            if self._last_mask is None or not np.array_equal(self._last_mask[0], mask):
-                side = 2 * self.mask_margin_px + 1
-                kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-                # Outside the picture counts as usable, or every frame would lose its border.
-                shrunk = cv2.erode(
-                    mask.astype(np.uint8) * 255, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=255
-                )
-                self._last_mask = (mask.copy(), np.asarray(shrunk, dtype=np.uint8))
-            plane = self._last_mask[1]
+            side = 2 * self.mask_margin_px + 1
+            kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+            # Outside the picture counts as usable, or every frame would lose its border.
+            shrunk = cv2.erode(
+                mask.astype(np.uint8) * 255, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=255
+            )
+            plane = np.asarray(shrunk, dtype=np.uint8)
         if trust is not None:
             if trust.shape != shape:
                 raise ValueError(f"trust has shape {trust.shape}, need {shape}")
@@ -194,10 +212,26 @@ class FrameStore:
     def get(self, frame: int, shrink: int = 1) -> StoredFrame:
         """The frame, or its mean over blocks of shrink x shrink px. Raises KeyError for a frame not stored."""
         key = (frame, shrink)
-        with self._lock:
-            if key in self._cache:
-                self._cache.move_to_end(key)
-                return self._cache[key]
+        while True:
+            with self._lock:
+                if key in self._cache:
+                    self._cache.move_to_end(key)
+                    return self._cache[key]
+                other = self._loading.get(key)
+                if other is None:
+                    self._loading[key] = threading.Event()
+                    break
+            other.wait()  # another thread reads it just now
+        try:
+            stored = self._load(frame, shrink)
+            with self._lock:
+                self._remember(key, stored)
+        finally:
+            with self._lock:
+                self._loading.pop(key).set()
+        return stored
+
+    def _load(self, frame: int, shrink: int) -> StoredFrame:
         width, height = self.size_px
         rgb = self._read(self._offset[frame], (height, width, 3))
         trust = self._read_trust(frame)
@@ -207,10 +241,7 @@ class FrameStore:
             rgb = np.asarray(cv2.resize(rgb[cut], small, interpolation=cv2.INTER_AREA), dtype=np.uint8)
             if trust is not None:
                 trust = trust[cut].reshape(small[1], shrink, small[0], shrink).min(axis=(1, 3))
-        stored = StoredFrame(rgb=rgb, trust=trust, shrink=shrink)
-        with self._lock:
-            self._remember(key, stored)
-        return stored
+        return StoredFrame(rgb=rgb, trust=trust, shrink=shrink)
 
     def _read_trust(self, frame: int) -> NDArray[np.uint8] | None:
         offset = self._trust_of.get(frame)

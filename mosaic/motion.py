@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numba
@@ -53,20 +52,31 @@ class Neighbour:
     at_px: NDArray[np.float32]
 
 
-@lru_cache(maxsize=16)
-def _hats(n: int, n_nodes: int, step: int) -> NDArray[np.float32]:
-    """Weights (n, n_nodes) of linear interpolation between nodes `step` apart."""
-    return np.maximum(1 - np.abs(np.arange(n)[:, None] / step - np.arange(n_nodes)), 0.0).astype(np.float32)
-
-
 def expand_map(nodes: NDArray[np.float64], step: int, size_px: tuple[int, int]) -> NDArray[np.float32]:
     """A map given at every step-th pixel (rows, columns, 2), one beyond each end, at all pixels (h, w, 2)."""
-    across, down = _hats(size_px[0], nodes.shape[1], step), _hats(size_px[1], nodes.shape[0], step)
     far = np.where(np.isfinite(nodes), nodes, -1e6).astype(np.float32)
     at = np.empty((size_px[1], size_px[0], 2), np.float32)
-    for i in (0, 1):
-        at[..., i] = down @ (far[..., i] @ across.T)
+    _interpolate(far, step, at)
     return at
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolate(nodes, step, at):  # type: ignore[no-untyped-def]
+    """Bilinear between nodes (rows, columns, 2) `step` apart, into at (h, w, 2)."""
+    height, width = at.shape[:2]
+    per = np.float32(1) / np.float32(step)
+    one = np.float32(1)
+    for i in range(height):
+        row = i // step
+        v = np.float32(i - row * step) * per
+        for left in range(0, width, step):
+            column = left // step
+            for c in range(2):
+                start = nodes[row, column, c] * (one - v) + nodes[row + 1, column, c] * v
+                end = nodes[row, column + 1, c] * (one - v) + nodes[row + 1, column + 1, c] * v
+                slope = (end - start) * per
+                for j in range(left, min(left + step, width)):
+                    at[i, j, c] = start + slope * np.float32(j - left)
 
 
 def tolerance(rgb: Plane, options: MotionOptions) -> NDArray[np.float32]:
@@ -114,7 +124,11 @@ def _judge(now, others, seen, frames, weight, allowed, alternative, verdict):  #
                     after += frames[k] > 0
             if before == 0 or after == 0:
                 continue
-            best = np.float32(0)
+            best, against = np.float32(0), np.float32(0)
+            for a in range(n_off):
+                against += weight[off[a]]
+            if own > 0 and not against > alternative * own:
+                continue  # even if all of them agreed
             for a in range(n_off):
                 ka = off[a]
                 support, earlier, later = np.float32(0), False, False
@@ -158,24 +172,47 @@ def align_neighbours(
 ) -> tuple[Plane, NDArray[np.bool_], NDArray[np.float32]]:
     """Neighbours on the pixels of `now`, levelled to its exposure: (k, h, w, 3), seen (k, h, w), frames (k,)."""
     height, width = now.shape[:2]
-    others = np.zeros((len(neighbours), height, width, 3), np.uint8)
-    seen = np.zeros((len(neighbours), height, width), bool)
+    others = np.empty((len(neighbours), height, width, 3), np.uint8)
+    seen = np.empty((len(neighbours), height, width), bool)
     frames = np.array([n.frames for n in neighbours], np.float32)
     sparse = np.s_[::6, ::6]
+    few = np.ascontiguousarray(now[sparse])
+    some, usable = np.empty_like(few), np.empty(few.shape[:2], bool)
     for k, neighbour in enumerate(neighbours):
-        x, y = neighbour.at_px[..., 0], neighbour.at_px[..., 1]
-        last_x, last_y = neighbour.rgb.shape[1] - 1, neighbour.rgb.shape[0] - 1
-        seen[k] = (x >= 0) & (x <= last_x) & (y >= 0) & (y <= last_y)
-        if not seen[k][sparse].any():
-            continue
-        warped = cv2.remap(neighbour.rgb, x, y, cv2.INTER_LINEAR)
-        usable = seen[k][sparse]
-        ratio = (now[sparse][usable] + 4.0) / (warped[sparse][usable] + 4.0)
-        gain = np.clip(np.median(ratio, axis=0), 0.5, 2.0)
-        levels = np.arange(256)[:, None] * gain
-        table = np.clip(np.rint(levels), 0, 255).astype(np.uint8)[:, None, :]
-        others[k] = cv2.LUT(warped, np.ascontiguousarray(table.reshape(1, 256, 3)))
+        at = neighbour.at_px
+        _warp(neighbour.rgb, np.ascontiguousarray(at[sparse]), np.ones(3, np.float32), some, usable)
+        gain = np.ones(3, np.float32)
+        if usable.any():
+            ratio = (few[usable].astype(np.float32) + 4.0) / (some[usable].astype(np.float32) + 4.0)
+            gain = np.clip(np.median(ratio.T, axis=1), 0.5, 2.0).astype(np.float32)
+        _warp(neighbour.rgb, at, gain, others[k], seen[k])
     return others, seen, frames
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _warp(rgb, at, gain, out, seen):  # type: ignore[no-untyped-def]
+    """rgb (H, W, 3) at the places at (h, w, 2), times gain (3,), bilinear, into out (h, w, 3) and seen (h, w)."""
+    height, width = rgb.shape[:2]
+    last_x, last_y = np.float32(width - 1), np.float32(height - 1)
+    one, top, rounding = np.float32(1), np.float32(255), np.float32(0.5)
+    flat, stride = rgb.reshape(-1), 3 * width
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            x, y = at[i, j, 0], at[i, j, 1]
+            inside = (x >= 0) and (x <= last_x) and (y >= 0) and (y <= last_y)
+            seen[i, j] = inside
+            if not inside:
+                out[i, j, 0], out[i, j, 1], out[i, j, 2] = 0, 0, 0
+                continue
+            xi, yi = min(int(x), width - 2), min(int(y), height - 2)
+            u, v = x - np.float32(xi), y - np.float32(yi)
+            k00, k01, k10, k11 = (one - u) * (one - v), u * (one - v), (one - u) * v, u * v
+            for c in range(3):
+                p = np.uintp(yi * stride + 3 * xi + c)
+                q = p + np.uintp(stride)
+                upper = k00 * np.float32(flat[p]) + k01 * np.float32(flat[p + np.uintp(3)])
+                lower = k10 * np.float32(flat[q]) + k11 * np.float32(flat[q + np.uintp(3)])
+                out[i, j, c] = np.uint8(min(gain[c] * (upper + lower) + rounding, top))
 
 
 def _solid(moves: Plane, options: MotionOptions) -> tuple[Plane, Plane]:

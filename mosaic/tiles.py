@@ -66,14 +66,17 @@ def paint(scene: Scene, canvas: Canvas, progress: Callable[[float], None] | None
         spread=canvas.zeros(size),
         support=canvas.zeros(size),
     )
-    # Row by row: neighbours share most of their frames, so the store's cache holds one tile's views and that is enough.
+    # Row by row: neighbours share most of their frames.
     tiles = [(x, y) for y in range(0, surface.height, step) for x in range(0, surface.width, step)]
     local, lock, done = threading.local(), threading.Lock(), [0]
 
-    def work(corner: tuple[int, int]) -> None:
-        x, y = corner
+    def work(index: int) -> None:
+        x, y = tiles[index]
         box = np.s_[y : y + step, x : x + step]
-        result = _tile(scene, x, y, min(step, surface.width - x), min(step, surface.height - y), local)
+        # To and fro through the views: the store's cache still holds the last ones of the tiles before.
+        backwards = index // scene.options.threads % 2 == 1
+        width, height = min(step, surface.width - x), min(step, surface.height - y)
+        result = _tile(scene, x, y, width, height, backwards, local)
         if result is not None:
             layers.image[box], layers.n_seen[box], layers.spread[box], layers.support[box] = result
         with lock:
@@ -84,14 +87,14 @@ def paint(scene: Scene, canvas: Canvas, progress: Callable[[float], None] | None
                 progress(done[0] / len(tiles))
 
     with ThreadPoolExecutor(scene.options.threads) as pool:
-        for _ in pool.map(work, tiles):
+        for _ in pool.map(work, range(len(tiles))):
             pass
     canvas.release()
     return layers
 
 
 def _tile(
-    scene: Scene, x0: int, y0: int, width: int, height: int, local: threading.local
+    scene: Scene, x0: int, y0: int, width: int, height: int, backwards: bool, local: threading.local
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]] | None:
     """image (h, w, 3), n_seen, spread, support of one tile; None where no view reaches it."""
     maps = scene.maps.get((x0, y0)) if scene.maps is not None else None
@@ -99,20 +102,20 @@ def _tile(
         maps = _tile_maps(scene, x0, y0, width, height)
         if scene.maps is not None:
             scene.maps[x0, y0] = maps
-    image, n_seen, spread, support = _blended(scene, maps, width, height, local)
+    image, n_seen, spread, support = _blended(scene, maps, width, height, backwards, local)
     if (n_seen == 0).any():
         # The lattice's rules leave out who sees a place too coarsely, or in a strip between its points.
         others = _fallback_maps(scene, x0, y0, n_seen == 0)
         if others:
             empty = n_seen == 0
-            filling = _blended(scene, others, width, height, local)
+            filling = _blended(scene, others, width, height, backwards, local)
             for layer, fill in zip((image, n_seen, spread, support), filling, strict=True):
                 layer[empty] = fill[empty]
     return (image, n_seen, spread, support) if n_seen.any() else None
 
 
 def _blended(
-    scene: Scene, maps: list[TileMap], width: int, height: int, local: threading.local
+    scene: Scene, maps: list[TileMap], width: int, height: int, backwards: bool, local: threading.local
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
     """image (h, w, 3), n_seen, spread, support of the views in `maps` over one tile."""
     options = scene.options
@@ -128,7 +131,8 @@ def _blended(
     vote, weight = (plane[: n * area].reshape(n, height, width) for plane in local.flags)
     everywhere = np.full((1, 1), 255, np.uint8)
     strongest = max(float(grid[..., 3].max()) for _, grid, _, _ in maps)
-    for row, (index, grid, step, shrink) in enumerate(maps):
+    for row in reversed(range(n)) if backwards else range(n):
+        index, grid, step, shrink = maps[row]
         # Views that hardly count in the mean only help to find the median: linear is good enough, at half the time.
         cubic = options.cubic and float(grid[..., 3].max()) > 0.2 * strongest
         frame = scene.store.get(scene.views[index].frame, shrink)

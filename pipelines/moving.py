@@ -29,7 +29,9 @@ LEAST_OVERLAP = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Small:
+class Small:
+    """A reduced picture (h, w, 3) uint8; kept: the store has the frame."""
+
     frame: int
     rgb: NDArray[np.uint8]
     kept: bool
@@ -38,6 +40,7 @@ class _Small:
 class MovingFinder:
     """Feed it the second pass's frames in order, then finish(): trust planes and the screen's mask go to the store.
 
+    reduce() may run in another thread than push() and finish(), each in the order of the frames.
     placements: approximate ones, by frame number; frames without one are passed over. kept: frames that the store
     gets."""
 
@@ -46,19 +49,25 @@ class MovingFinder:
         width, height = store.size_px
         self._shrink = max(1, round(width / SMALL_WIDTH_PX))
         self._size = (width // self._shrink, height // self._shrink)
-        self._ring: deque[_Small] = deque()
-        self._waiting: deque[_Small] = deque()
+        self._ring: deque[Small] = deque()
+        self._waiting: deque[Small] = deque()
         self._last_compared = -(10**9)
         self._last_look = -(10**9)
         self._fixed = ScreenFixed(self._size)
 
-    def push(self, frame: int, picture: Callable[[], NDArray[np.uint8]]) -> None:
-        """The next frame; its picture (h, w, 3) uint8 RGB is asked for only when it is needed."""
-        due = frame in self._kept or frame - self._last_compared >= EVERY
-        if due and frame in self._placements:
-            if frame - self._last_compared >= EVERY:
-                self._last_compared = frame
-            small = _Small(frame, self._reduced(picture()), frame in self._kept)
+    def reduce(self, frame: int, picture: Callable[[], NDArray[np.uint8]]) -> Small | None:
+        """The next frame as push() wants it; its picture (h, w, 3) uint8 RGB is asked for only when it is needed."""
+        kept = frame in self._kept
+        due = frame - self._last_compared >= EVERY
+        if frame not in self._placements or not (kept or due):
+            return None
+        if due:
+            self._last_compared = frame
+        return Small(frame, self._reduced(picture()), kept)
+
+    def push(self, frame: int, small: Small | None) -> None:
+        """The next frame. Judges those before it whose later neighbours are there now."""
+        if small is not None:
             self._ring.append(small)
             if small.kept:
                 self._waiting.append(small)
@@ -76,7 +85,7 @@ class MovingFinder:
         cut = rgb[: self._size[1] * self._shrink, : self._size[0] * self._shrink]
         return np.asarray(cv2.resize(cut, self._size, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def _decide(self, now: _Small) -> None:
+    def _decide(self, now: Small) -> None:
         while self._ring and now.frame - self._ring[0].frame > REACH:
             self._ring.popleft()
         neighbours = self._neighbours(now)
@@ -89,7 +98,7 @@ class MovingFinder:
                 if neighbour.frames * side > 0 and self._fixed.look(now.rgb, neighbour):
                     break
 
-    def _neighbours(self, now: _Small) -> list[Neighbour]:
+    def _neighbours(self, now: Small) -> list[Neighbour]:
         """The pictures nearest to the wanted distances on both sides, each once, that look at the same place."""
         nodes = self._nodes(now.frame)
         found: list[Neighbour] = []

@@ -6,6 +6,7 @@ warp, so that residual flow is measured where the linearisation holds. Poses com
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,15 +29,17 @@ SECOND = 2.0
 
 @dataclass(slots=True, eq=False)
 class Retracker:
-    """Registers a shot's frames against its keyframes with held cameras. `approximate` has a pose for every frame."""
+    """Registers a shot's frames against its keyframes with held cameras. `approximate` has a pose for every frame.
+
+    Safe to use from several threads."""
 
     tracker: ShotTracker
     approximate: Solution
     options: RegistrationOptions
     register_options: RegisterOptions = field(default_factory=RegisterOptions)
-    fits: list[PairFit] = field(default_factory=list)
     _row: dict[int, int] = field(init=False)
     _prepared: dict[int, PreparedTemplate] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
         self._row = {int(f): i for i, f in enumerate(self.approximate.frames)}
@@ -48,14 +51,14 @@ class Retracker:
             return None
         return CameraPose(log_f=float(self.approximate.log_f[row]), R=self.approximate.R[row])
 
-    def step(self, frame: int, pyramid: Pyramid) -> list[PairFit]:
-        """Register one frame to its nearest keyframes. Returns the new fits."""
+    def register(self, frame: int, pyramid: Pyramid) -> list[PairFit]:
+        """Fits of one frame to its nearest keyframes; none where the first pass has no camera for it."""
         pose = self.pose(frame)
         if pose is None or frame in self.tracker.keyframes:
             return []  # keyframes were registered to each other until they settled, and are held
         near = self._nearest(frame, pose)
         wanted = [index for distance, index in near[:LINKS] if distance <= SECOND * near[0][0] + 0.02]
-        new = []
+        fits = []
         for index in wanted:
             key_pose = self.pose(index)
             if key_pose is None:
@@ -69,17 +72,17 @@ class Retracker:
                 options=self.register_options,
                 route="refined",
             )
-            new.append(fit)
-        self.fits.extend(new)
-        return new
+            fits.append(fit)
+        return fits
 
     def _bound(self, index: int, pose: CameraPose) -> PreparedTemplate:
-        if index not in self._prepared:
-            if len(self._prepared) > 24:
-                self._prepared.pop(next(iter(self._prepared)))
-            family = RotationZoomFamily(lens=self.approximate.lens, log_f_src=pose.log_f)
-            self._prepared[index] = prepare(self.tracker.keyframes[index].template, family)
-        return self._prepared[index]
+        with self._lock:
+            if index not in self._prepared:
+                if len(self._prepared) > 24:
+                    self._prepared.pop(next(iter(self._prepared)))
+                family = RotationZoomFamily(lens=self.approximate.lens, log_f_src=pose.log_f)
+                self._prepared[index] = prepare(self.tracker.keyframes[index].template, family)
+            return self._prepared[index]
 
     def _nearest(self, frame: int, pose: CameraPose) -> list[tuple[float, int]]:
         """(displacement in widths, keyframe), nearest first; at least `min_overlap` of the picture in common."""

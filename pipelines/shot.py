@@ -22,7 +22,6 @@ from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
 from mosaic.composite import Panorama, composite
 from mosaic.framestore import FrameStore
-from mosaic.pyramid import build_pyramid
 from mosaic.records import MotionGraph, PairFit
 from mosaic.surface import Surface, choose_surface
 from mosaic.views import CompositeOptions, ViewPlan, plan_views
@@ -34,6 +33,7 @@ from pipelines.links import without_doubtful
 from pipelines.moving import MovingFinder
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
+from pipelines.second_pass import second_pass
 from pipelines.table import FrameFacts, blank_rows, concatenate, shot_rows
 from pipelines.tracking import Observation, ShotTracker
 
@@ -145,9 +145,17 @@ def solve_shot(
         surface, plan = _plan(approximate, tracker, world, config, options)
     store = FrameStore(scratch, tracker.size_px)
     try:
-        fits = _second_pass(
-            tracker, approximate, frames(), plan, store, mask, n_levels, config, timings, progress
-        )
+        with timings.measure("second pass"):
+            # Only where frames lie relative to each other counts here: the axes of the reference will do.
+            placed = placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px)
+            planned = set(plan.frames)
+            fits = second_pass(
+                frames(),
+                Retracker(tracker, approximate, config.registration, tracker.register_options),
+                MovingFinder({p.frame: p for p in placed}, planned, store),
+                store,
+                planned=planned, mask=mask, n_levels=n_levels, threads=config.run.threads or 2, progress=progress,
+            )  # fmt: skip
         with timings.measure("poses"):
             solution = _poses(tracker, result, [*fits, *_steps(tracker)])
             solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
@@ -340,56 +348,6 @@ def _plan(
         placements[::stride], config.panorama.projection, max_pixels=config.panorama.max_megapixels * 1e6
     )
     return surface, plan_views(placements, surface, options)
-
-
-def _second_pass(
-    tracker: ShotTracker,
-    approximate: Solution,
-    frames: Iterator[Frame],
-    plan: ViewPlan,
-    store: FrameStore,
-    mask: NDArray[np.bool_] | None,
-    n_levels: int,
-    config: Config,
-    timings: Timings,
-    progress: Callable[[str, int, int | None], None],
-) -> list[PairFit]:
-    """Decode the shot again: register every frame to refined keyframes, and keep the pictures of the plan."""
-    wanted = {o.frame for o in tracker.observations if o.reason != "duplicate"}
-    first, last = tracker.observations[0].frame, tracker.observations[-1].frame
-    planned = set(plan.frames)
-    # Only where frames lie relative to each other counts here: the axes of the reference will do.
-    placed = {
-        p.frame: p for p in placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px)
-    }
-    moving = MovingFinder(placed, planned, store)
-    retracker = Retracker(
-        tracker=tracker,
-        approximate=approximate,
-        options=config.registration,
-        register_options=tracker.register_options,
-    )
-    while True:
-        with timings.measure("decode again"):
-            frame = next(frames, None)
-        if frame is None:
-            break
-        if frame.index < first:
-            continue
-        if frame.index in wanted:
-            with timings.measure("register again"):
-                retracker.step(frame.index, build_pyramid(frame.gray, n_levels=n_levels, mask=mask))
-        if frame.index in planned:
-            with timings.measure("keep views"):
-                store.put(frame.index, frame.picture(), mask)
-        with timings.measure("what moves"):
-            moving.push(frame.index, frame.picture)
-        progress("second pass", frame.index - first + 1, last - first + 1)
-        if frame.index >= last:
-            break
-    with timings.measure("what moves"):
-        moving.finish()
-    return retracker.fits
 
 
 def _graph(tracker: ShotTracker, fits: Sequence[PairFit]) -> MotionGraph:

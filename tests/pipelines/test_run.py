@@ -90,7 +90,7 @@ def test_run_json_is_whole(pan_run: Finished) -> None:
         assert record["versions"][name]
     assert record["clip"]["size_px"] == list(SIZE) and record["clip"]["identity"]
     assert Config.model_validate(record["config"]).registration.n_fine == 3000
-    for stage in ("decode", "register", "keyframes", "register again", "composite", "write", "total"):
+    for stage in ("decode", "register", "keyframes", "second pass", "composite", "write", "total"):
         assert record["timings_s"][stage] > 0
     stages = sum(v for k, v in record["timings_s"].items() if k not in ("total", "report"))
     assert stages <= record["timings_s"]["total"]

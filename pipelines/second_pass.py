@@ -1,0 +1,89 @@
+"""Decode a shot again: each frame registered to the refined keyframes, the plan's pictures kept, what moves found.
+
+Frames are independent here, so registration runs in threads; pictures are stored in one more thread and judged in
+another, in order. Results come back in the order of the frames: any number of threads gives the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaic.framestore import FrameStore
+from mosaic.pyramid import build_pyramid
+from mosaic.records import PairFit
+from pipelines.decode import Frame
+from pipelines.moving import MovingFinder, Small
+from pipelines.retracking import Retracker
+
+AHEAD = (
+    6  # frames in work at once; each holds its gray, its pyramid and the decoder's picture (8 MB at 1080p)
+)
+
+
+def second_pass(
+    frames: Iterator[Frame],
+    retracker: Retracker,
+    moving: MovingFinder,
+    store: FrameStore,
+    *,
+    planned: set[int],
+    mask: NDArray[np.bool_] | None,
+    n_levels: int,
+    threads: int,
+    progress: Callable[[str, int, int | None], None],
+) -> list[PairFit]:
+    """Fits of all frames of the retracker's shot to its keyframes. Pictures of `planned` frames go to the store.
+
+    frames: reaches the shot's frames in order, may start before them. mask: usable pixels of all of them.
+    """
+    observations = retracker.tracker.observations
+    first, last = observations[0].frame, observations[-1].frame
+    wanted = {o.frame for o in observations if o.reason != "duplicate"}
+
+    def register(frame: Frame) -> list[PairFit]:
+        return retracker.register(frame.index, build_pyramid(frame.gray, n_levels=n_levels, mask=mask))
+
+    def keep(frame: Frame) -> Small | None:
+        picture = cache(frame.picture)  # a conversion, and both may ask for it
+        if frame.index in planned:
+            store.put(frame.index, picture(), mask)
+        return moving.reduce(frame.index, picture)
+
+    def judge(index: int, kept: Future[Small | None]) -> None:
+        moving.push(index, kept.result())
+
+    fits: list[PairFit] = []
+    under_way: deque[tuple[int, Future[list[PairFit]] | None, Future[None]]] = deque()
+
+    def settle() -> None:
+        index, registered, judged = under_way.popleft()
+        if registered is not None:
+            fits.extend(registered.result())
+        judged.result()
+        progress("second pass", index - first + 1, last - first + 1)
+
+    with (
+        ThreadPoolExecutor(threads) as registering,
+        ThreadPoolExecutor(1) as keeping,
+        ThreadPoolExecutor(1) as judging,
+    ):
+        for frame in frames:
+            if frame.index < first:
+                continue
+            registered = registering.submit(register, frame) if frame.index in wanted else None
+            kept = keeping.submit(keep, frame)
+            under_way.append((frame.index, registered, judging.submit(judge, frame.index, kept)))
+            if len(under_way) >= AHEAD:
+                settle()
+            if frame.index >= last:
+                break
+        while under_way:
+            settle()
+        judging.submit(moving.finish).result()
+    return fits
