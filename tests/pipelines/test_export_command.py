@@ -26,8 +26,8 @@ from pipelines.exports.whole_file import whole_folder
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.records import CameraTable
 from tests.pipelines.end_to_end import one_line, run
+from tests.pipelines.export_readers import decode_freed
 from tests.pipelines.export_truth import FIRST, LOST, N, Truth, truth
-from tests.pipelines.test_exports import decode_freed
 
 
 def finished(out: Path, known: Truth | None = None, table: CameraTable | None = None) -> Path:
