@@ -21,8 +21,11 @@ FORMAT_HELP = "\n\n".join(f"{entry.name}: {entry.what}" for entry in FORMATS)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
+    """Add the commands of this module and of cli_rays."""
+    from pipelines.cli_rays import rays
+
     app.command("export", epilog=FORMAT_HELP)(export)
+    app.command("rays")(rays)
 
 
 def print_json(document: Mapping[str, Any]) -> None:
