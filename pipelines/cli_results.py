@@ -1,4 +1,4 @@
-"""Commands that work on a finished run, without its video: export. `register` puts them into the application."""
+"""Commands besides the main job: export, rays (cli_rays.py) and doctor. `register` puts them into the application."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError, OutputError
+from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, EXIT_USAGE, InputError, OutputError
 from pipelines.exports.formats import FORMATS, NAMES, ExportOptions, format_named, parse_names
 
 Out = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
@@ -26,6 +26,7 @@ def register(app: typer.Typer) -> None:
 
     app.command("export", epilog=FORMAT_HELP)(export)
     app.command("rays")(rays)
+    app.command("doctor")(doctor)
 
 
 def print_json(document: Mapping[str, Any]) -> None:
@@ -170,3 +171,18 @@ def _send(
     elif not quiet:
         print(f"{sent} packets sent to {address[0]}:{address[1]}; {law}")
     return EXIT_OK
+
+
+def doctor(context: typer.Context, as_json: AsJson = False) -> int:
+    """What this installation can do: versions, codecs, GPU, threads, and what to do about what is missing."""
+    refuse_settings(context, "doctor")
+    from pipelines.doctor import as_document, as_text, examine
+
+    findings = examine()
+    document = as_document(findings)
+    code = EXIT_OK if document["ok"] else EXIT_USAGE
+    if as_json:
+        print_json({"exit_code": code, **document})
+    else:
+        print(as_text(findings))
+    return code
