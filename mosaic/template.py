@@ -6,7 +6,7 @@ About 12,000 pixels (0.4 MB) stand for a frame, so a shot's keyframes cost next 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -87,31 +87,11 @@ def build_template(
     geometry than the last strong edge in a crowd.
     """
     options = options or SelectionOptions()
-    mask, mask_sx, mask_sy, use_mask = mask_arguments(pyramid)
     wanted = range(len(pyramid.levels)) if levels is None else levels
     built: list[TemplateLevel | None] = [None] * len(pyramid.levels)
     for index in wanted:
-        level = pyramid.levels[index]
-        scale = pyramid.scales[index]
-        h, w = level.shape
-        n = options.n_per_level[min(index, len(options.n_per_level) - 1)]
-        bin_px = max(2, round((w * h / n) ** 0.5))
-        x, y, values, gx, gy = kernel.select_pixels(
-            level,
-            bin_px,
-            np.float32(options.threshold_grey),
-            mask,
-            scale[0] / mask_sx,
-            scale[1] / mask_sy,
-            use_mask,
-        )
-        src = to_full(np.stack([x, y], axis=1).astype(np.float64), scale)
-        built[index] = TemplateLevel(
-            src_px=src,
-            values=values,
-            gradients=np.stack([gx / np.float32(scale[0]), gy / np.float32(scale[1])], axis=1),
-            cell=cells_of(src, pyramid.size_px),
-        )
+        built[index] = _build_level(pyramid, index, options)
+    mask, mask_sx, mask_sy, use_mask = mask_arguments(pyramid)
     wide_level = min(len(pyramid.levels) - 1, 3)
     wide_px, wide_values = _wide_sample(pyramid, wide_level, mask, mask_sx, mask_sy, use_mask)
     return Template(
@@ -121,6 +101,34 @@ def build_template(
         wide_px=wide_px,
         wide_values=wide_values,
         wide_level=wide_level,
+    )
+
+
+def with_level(
+    template: Template, pyramid: Pyramid, index: int, *, options: SelectionOptions | None = None
+) -> Template:
+    """The template with one more level of the pyramid that it was built from."""
+    built = list(template.levels)
+    built[index] = _build_level(pyramid, index, options or SelectionOptions())
+    return replace(template, levels=tuple(built))
+
+
+def _build_level(pyramid: Pyramid, index: int, options: SelectionOptions) -> TemplateLevel:
+    mask, mask_sx, mask_sy, use_mask = mask_arguments(pyramid)
+    level, scale = pyramid.levels[index], pyramid.scales[index]
+    h, w = level.shape
+    n = options.n_per_level[min(index, len(options.n_per_level) - 1)]
+    bin_px = max(2, round((w * h / n) ** 0.5))
+    threshold = np.float32(options.threshold_grey)
+    x, y, values, gx, gy = kernel.select_pixels(
+        level, bin_px, threshold, mask, scale[0] / mask_sx, scale[1] / mask_sy, use_mask
+    )
+    src = to_full(np.stack([x, y], axis=1).astype(np.float64), scale)
+    return TemplateLevel(
+        src_px=src,
+        values=values,
+        gradients=np.stack([gx / np.float32(scale[0]), gy / np.float32(scale[1])], axis=1),
+        cell=cells_of(src, pyramid.size_px),
     )
 
 

@@ -16,13 +16,13 @@ import numpy as np
 from calib.records import Priors
 from calib.running import RunningCalibrator
 from mosaic.estimator import RegisterOptions
-from mosaic.pyramid import build_pyramid
 from pipelines.config import Config
 from pipelines.decode import Clip
 from pipelines.overlays import OverlayFinder
+from pipelines.preparation import prepare_frame
 from pipelines.progress import Progress, silent
 from pipelines.shots import ShotSplitter, TrackedShot
-from pipelines.tracking import ShotTracker
+from pipelines.tracking import ShotTracker, selection_of
 
 HALF_FROM_PX = 960  # width from which half the size still has the texture to register
 
@@ -74,7 +74,8 @@ def look_at(
             break
         n_frames += 1
         gray = frame.gray if shrink == 1 else cv2.resize(frame.gray, size_px, interpolation=cv2.INTER_AREA)
-        found = splitter.push(frame.index, frame.pts_s, build_pyramid(gray))
+        look = prepare_frame(frame.index, frame.pts_s, gray, selection=selection_of(config.registration))
+        found = splitter.push(look)
         shots += [_shot(shot, shrink) for shot in found]
         finder.update(frame.gray, shrink * splitter.last_motion_px)
         progress("first look", n_frames, expected)

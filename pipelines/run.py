@@ -12,6 +12,7 @@ import platform
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -21,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.estimator import RegisterOptions
-from mosaic.pyramid import build_pyramid
 from pipelines.archive import program_version
 from pipelines.config import Config
 from pipelines.decode import Clip, Frame, open_clip
@@ -30,13 +30,14 @@ from pipelines.exports.exporter import export_for_run
 from pipelines.keyframe_graph import KeyframeImages
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.overlays import OverlayFinder
+from pipelines.preparation import PreparedFrame, prepare_frame
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report.build import write_report
 from pipelines.shot import Timings, lost_rows, priors_of, solve_shot
 from pipelines.shot_files import thumbnail, write_shot
 from pipelines.shots import ShotSplitter, TrackedShot
 from pipelines.table import FrameFacts, concatenate
-from pipelines.tracking import ShotTracker
+from pipelines.tracking import ShotTracker, selection_of
 
 log = logging.getLogger(__name__)
 
@@ -146,16 +147,10 @@ def _first_pass(job: _Job) -> None:
     frames = _selected(job.clip, config)
     expected = job.clip.facts.n_frames_header if config.run.max_frames is None else config.run.max_frames
     count = 0
-    while True:
-        with job.timings.measure("decode"):
-            frame = next(frames, None)
-        if frame is None:
-            break
-        count += 1
-        _note(job, frame)
+
+    def follow(frame: Frame, look: Future[PreparedFrame]) -> None:
         with job.timings.measure("register"):
-            pyramid = build_pyramid(frame.gray, n_levels=job.n_levels, mask=job.mask)
-            done = list(splitter.push(frame.index, frame.pts_s, pyramid))
+            done = list(splitter.push(look.result()))
         if job.overlays is not None:
             with job.timings.measure("overlays"):
                 motion = splitter.last_motion_px
@@ -166,6 +161,26 @@ def _first_pass(job: _Job) -> None:
         for shot in done:
             _finish(job, shot)
         job.progress("first pass", count, expected)
+
+    with ThreadPoolExecutor(1) as preparing:
+        ahead: tuple[Frame, Future[PreparedFrame]] | None = None
+        while True:
+            with job.timings.measure("decode"):
+                frame = next(frames, None)
+            # Just one frame ahead: which mask a frame is prepared with must not depend on how fast threads are.
+            prepared = None
+            if frame is not None:
+                _note(job, frame)
+                prepared = frame, preparing.submit(
+                    prepare_frame, frame.index, frame.pts_s, frame.gray,
+                    selection=selection_of(config.registration), n_levels=job.n_levels, mask=job.mask,
+                )  # fmt: skip
+            if ahead is not None:
+                count += 1
+                follow(*ahead)
+            if prepared is None:
+                break
+            ahead = prepared
     if count == 0:
         raise InputError(job.clip.facts.path, "no picture in the chosen range", "lower run.start_frame")
     for shot in splitter.finish():

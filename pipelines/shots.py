@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from mosaic.pyramid import Pyramid
+from pipelines.preparation import PreparedFrame
 from pipelines.tracking import ShotTracker
 
 # Frames after a break at which the costly rescue is tried; plain prediction is tried on every frame.
@@ -48,23 +48,23 @@ class ShotSplitter:
         tracker = self._break.tracker if self._break else self._current
         return tracker.observations[-1].motion_px if tracker and tracker.observations else float("nan")
 
-    def push(self, frame: int, pts_s: float, pyramid: Pyramid) -> Iterator[TrackedShot]:
+    def push(self, look: PreparedFrame) -> Iterator[TrackedShot]:
         """Take the next frame; yields shots that it completes."""
         if self._current is None:
-            self._current = self._started(frame, pts_s, pyramid)
+            self._current = self._started(look)
             return
         if self._break is None:
-            if not self._current.step(frame, pts_s, pyramid):
-                self._break = _Break(times=[(frame, pts_s)], tracker=self._started(frame, pts_s, pyramid))
+            if not self._current.step(look):
+                self._break = _Break(times=[(look.frame, look.pts_s)], tracker=self._started(look))
             return
         waiting = self._break
         age = len(waiting.times)
-        if self._current.step(frame, pts_s, pyramid, rescue=age in RESCUE_AFTER):
+        if self._current.step(look, rescue=age in RESCUE_AFTER):
             self._repair(waiting)
             return
-        waiting.times.append((frame, pts_s))
-        if not waiting.tracker.step(frame, pts_s, pyramid, rescue=False):
-            waiting.tracker = self._restarted(waiting, frame, pts_s, pyramid)
+        waiting.times.append((look.frame, look.pts_s))
+        if not waiting.tracker.step(look, rescue=False):
+            waiting.tracker = self._restarted(waiting, look)
         if age >= self.bridge_frames:
             yield TrackedShot(tracker=self._current, end="cut")
             self._current, self._break = waiting.tracker, None
@@ -77,15 +77,15 @@ class ShotSplitter:
             yield TrackedShot(tracker=self._break.tracker, end="end")
         self._current, self._break = None, None
 
-    def _started(self, frame: int, pts_s: float, pyramid: Pyramid) -> ShotTracker:
+    def _started(self, look: PreparedFrame) -> ShotTracker:
         tracker = self.new_tracker()
-        tracker.start(frame, pts_s, pyramid)
+        tracker.start(look)
         return tracker
 
-    def _restarted(self, waiting: _Break, frame: int, pts_s: float, pyramid: Pyramid) -> ShotTracker:
+    def _restarted(self, waiting: _Break, look: PreparedFrame) -> ShotTracker:
         """The break's own tracker lost its track as well. Its frames stay unaccounted for: they belong to no shot."""
         _drop(waiting.tracker)
-        return self._started(frame, pts_s, pyramid)
+        return self._started(look)
 
     def _repair(self, waiting: _Break) -> None:
         """The bridge held: the frames in between were a flash, a glitch or a graphic, not a cut."""

@@ -20,12 +20,13 @@ from mosaic.coords import normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid
 from mosaic.records import FlowGrid, PairFit, PairStatus
-from mosaic.rescue import match_features, phase_correlation, small_gray
-from mosaic.template import PreparedTemplate, SelectionOptions, Template, build_template, prepare
+from mosaic.rescue import match_features, phase_correlation
+from mosaic.template import PreparedTemplate, SelectionOptions, Template, prepare, with_level
 from mosaic.warp import HomographyFamily
 from pipelines.bridge import CameraPose, RotationZoomFamily, edge_from_fit, pair_state, pose_from_state
 from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import KeyframeImages, distance_in_widths
+from pipelines.preparation import PreparedFrame
 
 log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
@@ -81,6 +82,11 @@ class Observation:
     estimate: CameraEstimate | None
 
 
+def selection_of(options: RegistrationOptions) -> SelectionOptions:
+    """Pixels per level: the configured numbers hold at 1080p and are not exceeded."""
+    return SelectionOptions(n_per_level=(options.n_fine, options.n_half, 2000, 1000, 600, 400))
+
+
 @dataclass(slots=True, eq=False)
 class ShotTracker:
     """The state of pass one within a shot. `step` returns False when the frame could not be linked at all."""
@@ -95,10 +101,7 @@ class ShotTracker:
     observations: list[Observation] = field(default_factory=list)
     calibrator: RunningCalibrator = field(init=False)
     _current: int = -1
-    _previous: Template | None = None
-    _previous_frame: int = -1
-    _previous_small: NDArray[np.uint8] | None = None
-    _previous_coarse: NDArray[np.generic] | None = None
+    _previous: PreparedFrame | None = None
     _pose: CameraPose | None = None  # of the previous frame, while calibrated
     _H_previous_keyframe: FloatArray = field(default_factory=lambda: np.eye(3))
     _H_step: FloatArray = field(default_factory=lambda: np.eye(3))
@@ -113,12 +116,6 @@ class ShotTracker:
         self.calibrator = RunningCalibrator(self.size_px, priors=self.priors, options=RUNNING)
 
     @property
-    def selection(self) -> SelectionOptions:
-        """Pixels per level, scaled to the picture: the configured numbers hold at 1080p and are not exceeded."""
-        o = self.options
-        return SelectionOptions(n_per_level=(o.n_fine, o.n_half, 2000, 1000, 600, 400))
-
-    @property
     def trusts_camera(self) -> bool:
         """Whether the running focal and lens are good enough to register with: far looser than to publish them."""
         solution = self.calibrator.solution
@@ -129,19 +126,20 @@ class ShotTracker:
         """Frame numbers seen by this tracker, in order."""
         return [o.frame for o in self.observations]
 
-    def start(self, frame: int, pts_s: float, pyramid: Pyramid) -> None:
+    def start(self, look: PreparedFrame) -> None:
         """Take the shot's first frame: it is the first keyframe and the provisional reference."""
-        estimate = self.calibrator.add_keyframe(frame, [])
-        self._add_keyframe(frame, pyramid)
-        self._remember(frame, pyramid)
+        estimate = self.calibrator.add_keyframe(look.frame, [])
+        self._add_keyframe(look)
+        self._previous = look
         self._pose = None
-        self._observe(frame, pts_s, "ok", "", 0.0, estimate)
+        self._observe(look.frame, look.pts_s, "ok", "", 0.0, estimate)
 
-    def step(self, frame: int, pts_s: float, pyramid: Pyramid, *, rescue: bool = True) -> bool:
+    def step(self, look: PreparedFrame, *, rescue: bool = True) -> bool:
         """Register the next frame, update the running camera, take a keyframe when due. False: nothing linked it."""
-        if self._is_duplicate(pyramid):
+        frame, pyramid = look.frame, look.pyramid
+        if self._is_duplicate(look):
             last = self.observations[-1]
-            self._observe(frame, pts_s, last.status, "duplicate", 0.0, last.estimate)
+            self._observe(frame, look.pts_s, last.status, "duplicate", 0.0, last.estimate)
             return True
         before = len(self.fits)
         linked = (
@@ -150,17 +148,17 @@ class ShotTracker:
             else self._step_free(frame, pyramid)
         )
         if not linked and rescue:
-            linked = self._rescue(frame, pyramid)
+            linked = self._rescue(look)
         if not linked:
             return False
         fits = [f for f in self.fits[before:] if f.usable]
         estimate = self.calibrator.update(frame, [edge_from_fit(f) for f in fits])
         self._follow(fits, estimate)
         motion = self._motion(fits)
-        self._observe(frame, pts_s, "ok", "", motion, estimate)
-        self._remember(frame, pyramid)
+        self._observe(frame, look.pts_s, "ok", "", motion, estimate)
+        self._previous = look
         if self._needs_keyframe(fits):
-            self._change_keyframe(frame, pyramid, fits)
+            self._change_keyframe(look, fits)
         return True
 
     def skip(self, frame: int, pts_s: float, status: str, reason: str) -> None:
@@ -179,7 +177,7 @@ class ShotTracker:
         step = self._H_step
         assert self._previous is not None
         fit, H_prev = align(
-            prepare(self._previous, family),
+            prepare(self._previous.template, family),
             pyramid,
             step,
             dst=frame,
@@ -188,12 +186,17 @@ class ShotTracker:
         )
         if not fit.usable and not np.array_equal(step, np.eye(3)):
             fit, H_prev = align(
-                prepare(self._previous, family), pyramid, np.eye(3), dst=frame, levels=coarse, route="still"
+                prepare(self._previous.template, family),
+                pyramid,
+                np.eye(3),
+                dst=frame,
+                levels=coarse,
+                route="still",
             )
         self.fits.append(fit)
         start = (H_prev if fit.usable else step) @ self._H_previous_keyframe
         keyframe = self.keyframes[self._current]
-        if keyframe.frame == self._previous_frame and fit.usable:
+        if keyframe.frame == self._previous.frame and fit.usable:
             levels: tuple[int, ...] = (0,)
         else:
             levels = (1, 0) if fit.usable else tuple(range(len(pyramid.levels) - 1, -1, -1))
@@ -205,7 +208,7 @@ class ShotTracker:
             levels=levels,
             options=self.register_options,
         )
-        if keyframe.frame == self._previous_frame and key_fit.usable:
+        if keyframe.frame == self._previous.frame and key_fit.usable:
             self.fits[-1] = key_fit  # one edge, the finer one
         else:
             self.fits.append(key_fit)
@@ -226,7 +229,7 @@ class ShotTracker:
         rate, turn = self._velocity
         predicted = CameraPose(log_f=self._pose.log_f + rate, R=turn @ self._pose.R)
         family = RotationZoomFamily(lens=lens, log_f_src=self._pose.log_f)
-        source = prepare(self._previous, family)
+        source = prepare(self._previous.template, family)
         coarse = self._coarse_levels(pyramid)
         fit, state = align(
             source,
@@ -277,34 +280,29 @@ class ShotTracker:
             self._velocity = (0.0, np.eye(3))
         return fit.usable or key_fit.usable
 
-    def _rescue(self, frame: int, pyramid: Pyramid) -> bool:
+    def _rescue(self, look: PreparedFrame) -> bool:
         """Lost: phase correlation, then features, against the previous frame and the keyframe; verified directly."""
-        small = small_gray(pyramid)
         family = self._free_family()
         keyframe = self.keyframes[self._current]
         candidates = [(keyframe.template, keyframe.small, True)]
-        if (
-            self._previous is not None
-            and self._previous_small is not None
-            and self._previous_frame != keyframe.frame
-        ):
-            candidates.insert(0, (self._previous, self._previous_small, False))
+        if self._previous is not None and self._previous.frame != keyframe.frame:
+            candidates.insert(0, (self._previous.template, self._previous.small, False))
         for route in ("phase correlation", "features"):
             for template, source_small, is_keyframe in candidates:
                 if route == "features":
-                    H = match_features(source_small, small, self.size_px)
+                    H = match_features(source_small, look.small, self.size_px)
                     if H is None:
                         continue
                 else:
-                    H, _ = phase_correlation(source_small, small, self.size_px)
+                    H, _ = phase_correlation(source_small, look.small, self.size_px)
                 levels = [
                     i for i in range(len(template.levels) - 1, -1, -1) if template.levels[i] is not None
                 ]
                 fit, state = align(
                     prepare(template, family),
-                    pyramid,
+                    look.pyramid,
                     H,
-                    dst=frame,
+                    dst=look.frame,
                     levels=levels,
                     options=self.register_options,
                     route=route,
@@ -340,8 +338,9 @@ class ShotTracker:
             or abs(np.log(zoom)) > share * np.log(self.options.keyframe_zoom)
         )
 
-    def _change_keyframe(self, frame: int, pyramid: Pyramid, fits: list[PairFit]) -> None:
+    def _change_keyframe(self, look: PreparedFrame, fits: list[PairFit]) -> None:
         """Go back to a known keyframe when one sees the same view, else make this frame a keyframe."""
+        frame, pyramid = look.frame, look.pyramid
         if self.trusts_camera and self._pose is not None:
             for distance, index in self._neighbours(self._pose)[:2]:
                 if index == self._current or distance > 0.6 * self.options.keyframe_shift:
@@ -375,7 +374,7 @@ class ShotTracker:
             links = [self._chain]
             self.fits.append(self._chain)
         self.calibrator.add_keyframe(frame, [edge_from_fit(f) for f in links])
-        self._add_keyframe(frame, pyramid)
+        self._add_keyframe(look)
         self._pose = self._keyframe_pose(frame) if self.trusts_camera else None
 
     def _link(self, index: int, pose: CameraPose, frame: int, pyramid: Pyramid) -> PairFit:
@@ -403,12 +402,13 @@ class ShotTracker:
             found.append((distance_in_widths(other, pose, self.size_px[0]), index))
         return sorted(found)
 
-    def _add_keyframe(self, frame: int, pyramid: Pyramid) -> None:
-        template = build_template(pyramid, frame, options=self.selection)
-        self.keyframes[frame] = Keyframe(frame=frame, template=template, small=small_gray(pyramid))
+    def _add_keyframe(self, look: PreparedFrame) -> None:
+        selection = selection_of(self.options)
+        template = with_level(look.template, look.pyramid, 0, options=selection)
+        self.keyframes[look.frame] = Keyframe(frame=look.frame, template=template, small=look.small)
         if self.images is not None:
-            self.images.put(frame, pyramid)
-        self._current = frame
+            self.images.put(look.frame, look.pyramid)
+        self._current = look.frame
         self._chain, self._n_chained = None, 0
         self._H_previous_keyframe = np.eye(3)
 
@@ -423,7 +423,8 @@ class ShotTracker:
         else:
             self._pose = None
         direct = next((f for f in fits if f.src == self._current), None)
-        step = next((f for f in fits if f.src == self._previous_frame), None)
+        assert self._previous is not None
+        step = next((f for f in fits if f.src == self._previous.frame), None)
         if direct is not None:
             self._chain, self._n_chained = direct, 0
         elif step is not None and self._chain is not None:
@@ -431,19 +432,12 @@ class ShotTracker:
         if self._chain is not None:
             self._H_previous_keyframe = self._chain.H_dst_src
 
-    def _remember(self, frame: int, pyramid: Pyramid) -> None:
-        levels = tuple(range(1, len(pyramid.levels)))
-        self._previous = build_template(pyramid, frame, options=self.selection, levels=levels)
-        self._previous_frame = frame
-        self._previous_small = small_gray(pyramid)
-        self._previous_coarse = pyramid.levels[min(2, len(pyramid.levels) - 1)]
-
-    def _is_duplicate(self, pyramid: Pyramid) -> bool:
+    def _is_duplicate(self, look: PreparedFrame) -> bool:
         """A repeated picture (24 to 30 conversions) differs far less from its predecessor than pictures usually do."""
-        if self._previous_coarse is None:
+        if self._previous is None:
             return False
-        coarse = pyramid.levels[min(2, len(pyramid.levels) - 1)]
-        change = float(np.abs(coarse.astype(np.float32) - self._previous_coarse.astype(np.float32)).mean())
+        before = self._previous.coarse.astype(np.float32)
+        change = float(np.abs(look.coarse.astype(np.float32) - before).mean())
         usual = float(np.median(self._changes)) if len(self._changes) >= 3 else float("nan")
         if change < 0.02 or (change < 0.25 * usual and change < 0.6):
             return True
@@ -451,8 +445,9 @@ class ShotTracker:
         return False
 
     def _motion(self, fits: list[PairFit]) -> float:
+        assert self._previous is not None
         for fit in fits:
-            if fit.src == self._previous_frame:
+            if fit.src == self._previous.frame:
                 return _displacement(fit.H_dst_src, self.size_px)[0]
         return _displacement(self._H_step, self.size_px)[0]
 
