@@ -1,10 +1,13 @@
 """Homographies to a calibrated camera track: self-calibration of a rotating and zooming camera.
 
-numpy and scipy only; knows no image. refine() calibrates a graph of keyframes, solve_poses() the frames in between,
+numpy and scipy only; knows no image. calibrate() takes a handful of homographies with covariance and gives cameras with
+covariance and a verdict. For shots: refine() calibrates a graph of keyframes, solve_poses() the frames in between,
 judge() says whether the focal length may be published, RunningCalibrator does it while frames arrive.
 """
 
+from calib.calibration import CalibrateOptions, Calibration
 from calib.gates import GateOptions, judge
+from calib.homography_fit import fit_homography
 from calib.level import LevelOptions, level
 from calib.observability import observability
 from calib.poses import PoseOptions, solve_poses
@@ -20,8 +23,11 @@ from calib.records import (
 )
 from calib.refine import RefineOptions, refine
 from calib.running import CameraEstimate, RunningCalibrator, RunningOptions
+from calib.selfcalibration import calibrate
 
 __all__ = [
+    "CalibrateOptions",
+    "Calibration",
     "CameraEstimate",
     "GateOptions",
     "HomographyEdge",
@@ -37,6 +43,8 @@ __all__ = [
     "RunningOptions",
     "Solution",
     "Verdict",
+    "calibrate",
+    "fit_homography",
     "judge",
     "level",
     "observability",

@@ -95,7 +95,8 @@ def zero_skew_rows_by_quaternion(rotations: ArrayLike) -> Array:
 def common_axis(rotations: ArrayLike, *, tolerance_rad: float = np.deg2rad(3.0)) -> Array:
     """Unit axis (3,) that all turns of R (n, 3, 3) against the first share, NaN if they differ or nothing turned.
 
-    tolerance_rad: largest angle between the axes; turns below 1e-6 rad have no axis.
+    tolerance_rad: angle between the axis and the longest turn's; a shorter turn may be off it by as much in rad as that
+    is for the longest, because noise tilts its axis more. Turns below 1e-6 rad have no axis.
     """
     R = np.asarray(rotations, float)
     w = rotation.log(R @ R[0].T)
@@ -104,8 +105,9 @@ def common_axis(rotations: ArrayLike, *, tolerance_rad: float = np.deg2rad(3.0))
         return np.full(3, np.nan)
     # Long turns know their axis best; the sign of an axis is none.
     axis = np.linalg.svd(w)[2][0]
-    across = np.linalg.norm(np.cross(w / np.linalg.norm(w, axis=-1, keepdims=True), axis), axis=-1)
-    return axis if np.all(across < np.sin(tolerance_rad)) else np.full(3, np.nan)
+    across = np.linalg.norm(np.cross(w, axis), axis=-1)
+    longest = np.linalg.norm(w, axis=-1).max()
+    return axis if np.all(across < np.sin(tolerance_rad) * longest) else np.full(3, np.nan)
 
 
 def free_intrinsics(null_space: ArrayLike, *, tolerance: float = 1e-3) -> tuple[str, ...]:

@@ -101,7 +101,7 @@ def test_the_homography_of_swapped_frames_is_the_inverse(x, y, z, zoom):
     "rotations", [turns((10, 0, 0), (20, 0, 0)), turns((10, 5, 0), (20, -5, 0), (-8, 9, 0))]
 )
 def test_every_other_null_vector_is_another_camera_with_zero_skew(rotations):
-    """The theorem read backwards: with (Q Q^T)^-1 = L, K R_k Q has zero skew in every view: nothing tells them apart."""
+    """The theorem read backwards: with (Q Q^T)^-1 = L, K R_k Q has zero skew in all views: nothing tells them apart."""
     found = observability(rotations)
     K0 = camera()
     for L in found.null_space:
