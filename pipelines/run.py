@@ -34,7 +34,7 @@ from pipelines.preparation import PreparedFrame, prepare_frame
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report.build import write_report
 from pipelines.shot import Timings, lost_rows, priors_of, solve_shot
-from pipelines.shot_files import thumbnail, write_shot
+from pipelines.shot_files import thumbnails, write_shot
 from pipelines.shots import ShotSplitter, TrackedShot
 from pipelines.table import FrameFacts, concatenate
 from pipelines.tracking import ShotTracker, selection_of
@@ -238,9 +238,7 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
         for stage, seconds in solved.timings.seconds.items():
             job.timings.seconds[stage] = job.timings.seconds.get(stage, 0.0) + seconds
         job.folder.save_shot(record, rows)
-    picture = thumbnail(tracker)
-    if picture is not None:
-        job.thumbnails[record.reference_frame] = picture
+    job.thumbnails |= thumbnails(tracker)
     images.close()
     job.images.pop(id(tracker), None)
     job.records.append(record)

@@ -23,6 +23,8 @@ from pipelines.table import status_counts
 from pipelines.tracking import ShotTracker
 
 OUTLINES = 200  # frames whose outline the report can draw
+THUMBNAILS = 40  # pictures of a shot in the report's film strip: more than a screen has room for
+THUMBNAIL_PX = 160  # wide; 3 KB each
 
 
 def write_shot(
@@ -138,16 +140,19 @@ def panorama_facts(panorama: Panorama) -> dict[str, Any]:
     }
 
 
-def thumbnail(tracker: ShotTracker) -> bytes | None:
-    """A small gray JPEG of the shot's middle keyframe for the report."""
+def thumbnails(tracker: ShotTracker) -> dict[int, bytes]:
+    """Frame -> small gray JPEG of the shot's keyframes, at most THUMBNAILS of them, the first and the last among them."""
     keys = sorted(tracker.keyframes)
-    small = tracker.keyframes[keys[len(keys) // 2]].small
-    width = 240
-    picture = cv2.resize(
-        small, (width, max(1, round(small.shape[0] * width / small.shape[1]))), interpolation=cv2.INTER_AREA
-    )
-    good, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return data.tobytes() if good else None
+    chosen = np.unique(np.linspace(0, len(keys) - 1, min(len(keys), THUMBNAILS)).round().astype(int))
+    encoded = {}
+    for key in (keys[i] for i in chosen):
+        small = tracker.keyframes[key].small
+        size = (THUMBNAIL_PX, max(1, round(small.shape[0] * THUMBNAIL_PX / small.shape[1])))
+        picture = cv2.resize(small, size, interpolation=cv2.INTER_AREA)
+        good, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 75])
+        if good:
+            encoded[int(key)] = data.tobytes()
+    return encoded
 
 
 def write_panorama(folder: OutputFolder, name: str, shot: CalibratedShot, config: Config) -> list[str]:

@@ -41,6 +41,9 @@ def print_summary(out: Path, record: RunRecord) -> None:
             console.print(escape(f"shot {shot.index}: {shot.sentence}"))
     for warning in record.warnings:
         console.print(escape(f"note: {warning}"))
+    exports = record.config.get("output", {}).get("exports") or ()
+    if exports:
+        console.print(escape(f"exports: {', '.join(exports)}, notes beside each (NAME.notes.json)"))
     console.print(escape(f"results: {out / 'report.html'}, {out / 'camera.csv'}, {out / 'run.json'}"))
 
 

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report import words
+from pipelines.report.graph import registration_graph
 from pipelines.report.pictures import data_uri, panoramas, thumbnail_uris
 from pipelines.report.series import series_json
 
@@ -33,6 +34,9 @@ CALIBRATION_NOTES = {
     "n_edges": "pairs of pictures that were aligned against each other",
     "support_rows": "rows of the picture that carry the evidence",
 }
+# What the sentence above the verdict's table says already.
+ALREADY_SAID = ("claims_focal", "reason", "sentence")
+UNITS = {"_px": " px", "_deg": "°", "_s": " s"}  # by the end of a name
 
 
 def write_report(
@@ -63,6 +67,7 @@ def render(out: Path, run: RunRecord, table: CameraTable, thumbnails: Mapping[in
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["breakable"] = breakable
     pictures = panoramas(out, run.shots)
     uris = thumbnail_uris(thumbnails)
     data = series_json(table) | {
@@ -81,7 +86,7 @@ def render(out: Path, run: RunRecord, table: CameraTable, thumbnails: Mapping[in
         clip_line=clip_line(run.clip),
         seen=words.seen(run, table),
         troubles=words.troubles(run.shots, table),
-        shots=[shot_view(shot, table, thumbnails, pictures[shot.index]) for shot in run.shots],
+        shots=[shot_view(out, shot, table, thumbnails, pictures[shot.index]) for shot in run.shots],
         statuses=status_counts(table),
         signs=words.STATUS_SIGNS,
         timings=timing_rows(run, len(table)),
@@ -105,6 +110,11 @@ def script_json(data: Any) -> Markup:
     return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
 
 
+def breakable(name: str) -> Markup:
+    """A dotted name that may be broken behind its dots and underscores, and nowhere within a word."""
+    return Markup(str(escape(name)).replace("_", "_<wbr>").replace(".", ".<wbr>"))
+
+
 def clip_name(clip: Mapping[str, Any]) -> str:
     return Path(str(clip.get("path") or clip.get("name") or "clip")).name
 
@@ -126,7 +136,11 @@ def clip_line(clip: Mapping[str, Any]) -> str:
 
 
 def shot_view(
-    shot: ShotRecord, table: CameraTable, thumbnails: Mapping[int, bytes], picture: Mapping[str, Any]
+    out: Path,
+    shot: ShotRecord,
+    table: CameraTable,
+    thumbnails: Mapping[int, bytes],
+    picture: Mapping[str, Any],
 ) -> dict[str, Any]:
     """A shot as the template shows it: words, table cells, verdict rows, panorama."""
     facts = words.shot_facts(table, shot.index)
@@ -155,9 +169,13 @@ def shot_view(
         "calibration": [
             (key, text, CALIBRATION_NOTES.get(key.rpartition(".")[2], ""))
             for key, text in flat(
-                shot.calibration, percent=("sigma_log_f", "sigma_parts", "sigma_mean_log_f")
+                {key: value for key, value in shot.calibration.items() if key not in ALREADY_SAID},
+                percent=("sigma_log_f", "sigma_parts", "sigma_mean_log_f", "sigma_relative"),
             )
         ],
+        "graph": registration_graph(
+            out / f"shot-{shot.index:03d}" / "pairs.npz", shot.calibration.get("keyframes") or ()
+        ),
         "panorama": picture,
         "panorama_rows": list(flat({k: v for k, v in (shot.panorama or {}).items() if k != "outlines"})),
         "timings": [(stage, f"{seconds:.2f} s") for stage, seconds in shot.timings_s.items()],
@@ -194,7 +212,9 @@ def flat(value: Any, prefix: str = "", percent: tuple[str, ...] = ()) -> Iterato
     in_percent = not prefix.endswith("_px") and any(
         part.startswith(name) for part in prefix.split(".") for name in percent
     )
-    yield prefix, text_of(value, in_percent=in_percent)
+    unit = next((sign for end, sign in UNITS.items() if prefix.endswith(end)), "")
+    text = text_of(value, in_percent=in_percent)
+    yield prefix, text + unit if isinstance(value, float | int) and not isinstance(value, bool) else text
 
 
 def text_of(value: Any, *, in_percent: bool = False) -> str:

@@ -32,6 +32,7 @@ class Page(HTMLParser):
         self.words: list[str] = []
         self.block = ""
         self._inside = ""
+        self._glued = False
         self.feed(text)
         self.data: dict[str, Any] = json.loads(
             self.block, parse_constant=lambda name: pytest.fail(f"{name} in JSON")
@@ -40,6 +41,8 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
+        if tag == "wbr":  # a place to break a line at, not a gap between words
+            self._glued = True
         if tag in {"script", "style"}:
             self._inside = "data" if dict(attrs).get("id") == "data" else "code"
 
@@ -50,6 +53,9 @@ class Page(HTMLParser):
     def handle_data(self, data: str) -> None:
         if self._inside == "data":
             self.block += data
+        elif not self._inside and self._glued:
+            self.words[-1] += data
+            self._glued = False
         elif not self._inside:
             self.words.append(data)
 

@@ -60,7 +60,8 @@
     for (let k = 0; k < y.length; k++) if (y[k] !== null && (k === 0 || y[k - 1] === null) && (k === y.length - 1 || y[k + 1] === null)) out.push(k);
     return out;
   };
-  const width = () => Math.max(260, holder.clientWidth);
+  let printing = false;
+  const width = () => Math.max(260, printing ? Math.min(holder.clientWidth, 680) : holder.clientWidth); // 680: A4 in CSS px
   let axisFrom = data.frame[0], axisTo = Math.max(data.frame[n - 1], axisFrom + 1), zooming = false;
   const full = [axisFrom, axisTo];
   for (const spec of CHARTS) {
@@ -74,7 +75,8 @@
       continue;
     }
     listeners.push((i) => { value.textContent = C[spec.key][i] === null ? "not known" : spec.text(i); });
-    const line = { stroke: () => css("accent"), width: 1.5, points: { show: true, size: 4, filter: isolated } };
+    // pxAlign 0: rounded to whole pixels, a slow pan would look like stairs.
+    const line = { stroke: () => css("accent"), width: 1.5, pxAlign: 0, points: { show: true, size: 4, filter: isolated } };
     const edge = { stroke: "transparent", width: 0, points: { show: false } };
     const focal = spec.key === "f_px";
     const options = {
@@ -100,7 +102,7 @@
           axisFrom = u.scales.x.min; axisTo = u.scales.x.max;
           plots.forEach((p) => { if (p !== u) p.setScale("x", { min: axisFrom, max: axisTo }); });
           zooming = false;
-          drawStrip(); place();
+          drawStrip(); drawFilm(); place();
         }],
       },
     };
@@ -191,6 +193,40 @@
     document.querySelectorAll(".swatch").forEach((canvas) => paint(prepare(canvas, 28, 14), canvas.dataset.status, 0, 0, 28, 14));
   }
 
+  // ---- the film strip: pictures of the clip at their place over the curves
+  const film = document.getElementById("film"), SLOT = 92; // px for a picture
+  const thumbFrames = Object.keys(data.thumbnails).map(Number).sort((a, b) => a - b);
+  function nearest(sorted, frame) { // of ascending numbers
+    let lo = 0, hi = sorted.length - 1;
+    while (lo < hi) { const mid = (lo + hi) >> 1; if (sorted[mid] < frame) lo = mid + 1; else hi = mid; }
+    return lo && frame - sorted[lo - 1] < sorted[lo] - frame ? sorted[lo - 1] : sorted[lo];
+  }
+  function drawFilm() {
+    film.hidden = thumbFrames.length < 2;
+    if (film.hidden) return;
+    const plotWidth = width() - LEFT - RIGHT, slots = Math.max(1, Math.floor(plotWidth / SLOT)), step = (axisTo - axisFrom) / slots;
+    const pictures = [];
+    for (let k = 0; k < slots; k++) {
+      // Half a slot early or late is near enough to stand here: keyframes do not come at even times.
+      const from = axisFrom + k * step, frame = nearest(thumbFrames, from + step / 2);
+      if (frame < from - step / 2 || frame > from + 1.5 * step || pictures.some((p) => +p.dataset.frame === frame)) continue;
+      const picture = document.createElement("img");
+      picture.src = data.thumbnails[frame]; picture.alt = ""; picture.title = "frame " + frame; picture.dataset.frame = frame; picture.draggable = false;
+      picture.style.left = LEFT + k * plotWidth / slots + "px"; picture.style.width = plotWidth / slots - 3 + "px";
+      pictures.push(picture);
+    }
+    film.replaceChildren(...pictures);
+    markFilm();
+  }
+  function markFilm() {
+    const pictures = [...film.children];
+    if (!pictures.length || selected < 0) return;
+    const now = nearest(pictures.map((picture) => +picture.dataset.frame), data.frame[selected]);
+    pictures.forEach((picture) => picture.classList.toggle("now", +picture.dataset.frame === now));
+  }
+  film.addEventListener("pointermove", fromStrip); film.addEventListener("pointerdown", fromStrip);
+  listeners.push(markFilm);
+
   // ---- outlines on the panoramas
   const FAINT = 24; // outlines of a shot that are always there
   document.querySelectorAll(".pano").forEach((pano) => {
@@ -198,19 +234,39 @@
     const frames = Object.keys(outlines).map(Number).sort((a, b) => a - b);
     if (!frames.length) return;
     const points = (frame) => outlines[frame].map((p) => p.join(",")).join(" ");
+    const middle = (corners) => [0, 1].map((c) => corners.reduce((sum, p) => sum + p[c], 0) / corners.length);
+    const middles = frames.map((frame) => middle(outlines[frame]));
+    const holds = (corners, x, y) => { // whether a point is inside: edges crossed to its right, odd or even
+      let inside = false;
+      for (let a = corners.length - 1, b = 0; b < corners.length; a = b++) {
+        const [xa, ya] = corners[a], [xb, yb] = corners[b];
+        if (ya > y !== yb > y && x < ((xb - xa) * (y - ya)) / (yb - ya) + xa) inside = !inside;
+      }
+      return inside;
+    };
+    const fromPano = (event) => { // of the frames that see the point, the one that has it nearest to its middle
+      const box = svg.getBoundingClientRect(), full = svg.viewBox.baseVal;
+      const x = ((event.clientX - box.left) / box.width) * full.width, y = ((event.clientY - box.top) / box.height) * full.height;
+      let best = -1, away = Infinity;
+      frames.forEach((frame, k) => {
+        const d = Math.hypot(middles[k][0] - x, middles[k][1] - y);
+        if (d < away && holds(outlines[frame], x, y)) { best = frame; away = d; }
+      });
+      if (best >= 0) select(rowNear(best));
+    };
+    pano.addEventListener("pointermove", fromPano); pano.addEventListener("pointerdown", fromPano);
     const step = Math.ceil(frames.length / FAINT);
     svg.innerHTML = frames.filter((_, k) => k % step === 0).map((f) => '<polygon class="faint" points="' + points(f) + '"/>').join("") +
       '<polygon class="halo"/><polygon class="now"/>';
     listeners.push((row) => {
       const here = data.shot[row] === shot, frame = data.frame[row];
-      const near = here && frames.reduce((a, b) => (Math.abs(b - frame) < Math.abs(a - frame) ? b : a));
+      const near = here && nearest(frames, frame);
       svg.querySelectorAll(".halo, .now").forEach((polygon) => polygon.setAttribute("points", here ? points(near) : ""));
     });
   });
 
   // ---- the bar at the foot: slider, words, thumbnail
   const slider = document.getElementById("slider"), readout = document.getElementById("readout"), thumb = document.getElementById("cursor-thumb");
-  const thumbFrames = Object.keys(data.thumbnails).map(Number).sort((a, b) => a - b);
   slider.max = n - 1;
   slider.addEventListener("input", () => select(+slider.value));
   listeners.push((row) => {
@@ -232,7 +288,7 @@
     }));
     slider.value = row; slider.setAttribute("aria-valuetext", parts.join(", "));
     if (thumbFrames.length) {
-      const near = thumbFrames.reduce((a, b) => (Math.abs(b - data.frame[row]) < Math.abs(a - data.frame[row]) ? b : a));
+      const near = nearest(thumbFrames, data.frame[row]);
       if (thumb.alt !== "Frame " + near) thumb.src = data.thumbnails[near];
       thumb.alt = "Frame " + near; thumb.hidden = false;
     }
@@ -246,15 +302,18 @@
   });
 
   // ---- size, theme, paper
-  function redraw() { drawSwatches(); drawStrip(); plots.forEach((u) => u.redraw()); place(); }
+  function redraw() { drawSwatches(); drawStrip(); drawFilm(); plots.forEach((u) => u.redraw()); place(); }
   function resize(w) { plots.forEach((u) => u.setSize({ width: w, height: u.height })); redraw(); }
   let last = width();
   window.addEventListener("resize", () => { if (width() !== last) { last = width(); resize(last); } });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
-  matchMedia("print").addEventListener("change", (event) => resize(event.matches ? Math.min(width(), 680) : width()));
+  // Before the browser lays the page out for paper: what is wider than that would shrink everything.
+  const paper = (on) => { if (printing !== on) { printing = on; resize(width()); } };
+  window.addEventListener("beforeprint", () => paper(true)); window.addEventListener("afterprint", () => paper(false));
+  matchMedia("print").addEventListener("change", (event) => paper(event.matches));
   window.addEventListener("beforeprint", () => document.querySelectorAll("section.shot details").forEach((d) => { d.open = true; }));
   document.getElementById("cursor").hidden = false;
-  drawSwatches(); drawStrip();
+  drawSwatches(); drawStrip(); drawFilm();
   select(0);
   document.documentElement.dataset.ready = plots.length;
 })();
