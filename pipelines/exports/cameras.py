@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib.rotation import from_pan_tilt_roll
 from pipelines.archive import read_camera_csv, read_run
+from pipelines.errors import InputError
 from pipelines.records import CameraTable, RunRecord
 
 FloatArray = NDArray[np.float64]
@@ -134,10 +135,15 @@ class ShotCameras:
 def shot_cameras(
     run: RunRecord, table: CameraTable, sensor_width_mm: float | None = None
 ) -> list[ShotCameras]:
-    """The cameras of every shot of a run. sensor_width_mm: None = as the run's configuration says, if it does."""
+    """The cameras of every shot of a run. sensor_width_mm: None = as the run's configuration says, if it does.
+
+    Raises InputError: the record does not say how large the pictures are.
+    """
     if sensor_width_mm is None:
         sensor_width_mm = run.config.get("calibration", {}).get("sensor_width_mm")
     clip = run.clip
+    if not clip.get("size_px"):
+        raise InputError("run.json", "does not say how large the pictures are", "run again")
     fps = float(clip.get("fps") or 25.0)
     result = []
     for shot in run.shots:

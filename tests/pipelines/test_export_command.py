@@ -108,6 +108,17 @@ def test_mistakes_are_one_line_and_exit_2(tmp_path: Path, capsys: pytest.Capture
         assert said in one_line(shown.err) and shown.out == ""
 
 
+def test_a_record_without_a_picture_size_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = truth()
+    with OutputFolder(tmp_path / "out", "digest") as folder:
+        folder.write_camera(known.table())
+        folder.publish(dataclasses.replace(known.run(), clip={"path": "a.mp4"}))
+    assert cli.main(["export", str(tmp_path / "out"), "--to", "usd"]) == 2
+    assert "how large the pictures are" in one_line(capsys.readouterr().err)
+
+
 def test_a_missing_extra_says_what_to_install(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
