@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipelines.archive import read_camera_csv
+from pipelines.exports.formats import format_named
 from pipelines.records import CameraTable, RunRecord
 
 WIDTH = 120  # columns where stdout is no terminal and has no width of its own
@@ -43,8 +44,21 @@ def print_summary(out: Path, record: RunRecord) -> None:
         console.print(escape(f"note: {warning}"))
     exports = record.config.get("output", {}).get("exports") or ()
     if exports:
-        console.print(escape(f"exports: {', '.join(exports)}, notes beside each (NAME.notes.json)"))
+        console.print(escape(f"exports: {', '.join(export_words(out, record, name) for name in exports)}"))
     console.print(escape(f"results: {out / 'report.html'}, {out / 'camera.csv'}, {out / 'run.json'}"))
+
+
+def export_words(out: Path, record: RunRecord, name: str) -> str:
+    """'usd' when every shot has it, 'usd (1 of 3 shots, see its notes)' when some have no camera."""
+    form = format_named(name)
+    if not form.per_shot or not record.shots:
+        return name
+    written = sum((out / f"shot-{shot.index:03d}" / form.file).exists() for shot in record.shots)
+    return (
+        name
+        if written == len(record.shots)
+        else f"{name} ({written} of {len(record.shots)} shots, see its notes)"
+    )
 
 
 def focal_range(camera: CameraTable, rows: np.ndarray) -> str:

@@ -19,6 +19,7 @@ from calib.rotation import from_pan_tilt_roll
 from pipelines.archive import read_camera_csv, read_run
 from pipelines.errors import InputError
 from pipelines.records import CameraTable, RunRecord
+from pipelines.report.words import reason_words
 
 FloatArray = NDArray[np.float64]
 
@@ -57,6 +58,7 @@ class ShotCameras:
     fps: float
     picture_fps: float
     sensor_width_mm: float | None
+    why_none: str  # what the run says of a shot that no focal length could be found for
     frame: NDArray[np.int64]
     pts_s: FloatArray
     timecode: tuple[str, ...]
@@ -159,6 +161,7 @@ def shot_cameras(
                 fps=fps,
                 picture_fps=float(clip.get("picture_fps") or fps),
                 sensor_width_mm=sensor_width_mm,
+                why_none=(shot.sentence or reason_words(shot.reason)[0]) if shot.reason else "",
                 frame=table.frame[rows],
                 pts_s=table.pts_s[rows],
                 timecode=_texts(table.timecode, rows),

@@ -67,6 +67,7 @@ def export_run(
 
 def export_for_run(run: RunRecord, table: CameraTable, names: Sequence[str], out: Path) -> None:
     """The exports that a run was asked for. What a format cannot hold is a warning: the run's own files stay."""
+    missing: dict[str, list[str]] = {}
     for name in names:
         try:
             results = export_run(run, table, [name], out)
@@ -75,7 +76,9 @@ def export_for_run(run: RunRecord, table: CameraTable, names: Sequence[str], out
             continue
         for result in results:
             if result.path is None:
-                log.warning("export %s: %s", name, result.why)
+                missing.setdefault(result.why, []).append(name)
+    for why, affected in missing.items():
+        log.warning("not exported to %s: %s", ", ".join(affected), why)
 
 
 def chosen_shots(
@@ -128,11 +131,8 @@ def export_shot(
         more = {"panorama_json": canvas} if form.name == "pto" else {}
         special = dict(module.write(path, cameras, options, **more))
     else:
-        first = cameras.left_out[0] if cameras.left_out else None
-        reason = (
-            reason_words(first.reason)[0] if first is not None and first.reason else "no frame has a camera"
-        )
-        why = f"no frame of shot {cameras.shot} has a calibrated camera: {reason}"
+        because = cameras.why_none.rstrip(".") or "the run says no more"
+        why = f"no frame of shot {cameras.shot} has a calibrated camera: {because[:1].lower()}{because[1:]}"
     notes = notes_path(path)
     write_json(notes, {**_head(form, path if not why else None), **_shot_notes(cameras, table), **special})
     return Exported(

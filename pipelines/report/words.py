@@ -213,15 +213,18 @@ def seen(run: RunRecord, table: CameraTable) -> str:
     """One sentence: how much picture went in and how much of it has a camera."""
     n = len(table)
     counts = Counter(table.status)
-    n_camera = sum(counts[word] for word in ("ok", "weak", "interpolated"))
+    # By the focal length, not by the status: a bridged frame of a relative shot has none either.
+    n_camera = int(np.isfinite(table.f_px).sum())
+    n_relative = sum(counts[word] for word in ("ok", "weak", "interpolated", "relative")) - n_camera
     share = f"{100 * n_camera / n:.1f} %" if n else "none"
     words = f"{plural(n, 'frame')} in {plural(len(run.shots), 'shot')}. "
     if not n:
         return words + "Nothing could be measured."
-    words += f"{plural(n_camera, 'frame')} ({share}) have a calibrated camera"
-    rest = [f"{plural(counts[word], 'frame')} {text}" for word, text in (
-        ("relative", "with zoom and motion only"), ("lost", "lost"), ("graphic", "not views of the scene"),
-    ) if counts[word]]  # fmt: skip
+    words += f"{plural(n_camera, 'frame')} ({share}) {'has' if n_camera == 1 else 'have'} a calibrated camera"
+    rest = [f"{plural(count, 'frame')} {text}" for count, text in (
+        (n_relative, "with zoom and motion only"), (counts["lost"], "lost"),
+        (counts["graphic"], "not views of the scene"),
+    ) if count]  # fmt: skip
     return words + (f"; {', '.join(rest)}." if rest else ".")
 
 

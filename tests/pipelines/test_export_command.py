@@ -25,6 +25,7 @@ from pipelines.exports.formats import FORMATS, NAMES, parse_names
 from pipelines.exports.whole_file import whole_folder
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.records import CameraTable
+from pipelines.summary import print_summary
 from tests.pipelines.end_to_end import one_line, run
 from tests.pipelines.export_readers import decode_freed
 from tests.pipelines.export_truth import FIRST, LOST, N, Truth, truth
@@ -210,13 +211,26 @@ def test_names_of_a_run_are_settings(tmp_path: Path) -> None:
 
 def test_a_run_without_a_camera_keeps_its_results(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     known = truth()
-    export_for_run(known.run(), no_camera(), ("usd", "json"), tmp_path)
+    export_for_run(known.run(), no_camera(), ("usd", "json", "chan"), tmp_path)
     assert (tmp_path / "camera.json").is_file()
     assert [r.levelname for r in caplog.records] == ["WARNING"] * 2
-    assert "no frame of shot 0 has a calibrated camera" in caplog.text
+    assert "not exported to usd, chan: no frame of shot 0 has a calibrated camera" in caplog.text
     narrow = truth(aspect=45 / 64)
     export_for_run(narrow.run(), narrow.table(), ("pto",), tmp_path)
     assert "not square" in caplog.text and "choose colmap" in caplog.text
+
+
+def test_the_final_table_says_how_many_shots_an_export_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = truth()
+    record = dataclasses.replace(known.run(), config={"output": {"exports": ["usd", "json"]}})
+    with OutputFolder(tmp_path / "out", "digest") as folder:
+        folder.write_camera(known.table())
+        export_for_run(record, known.table(), ("usd", "json"), folder.staging)
+        folder.publish(record)
+    print_summary(tmp_path / "out", record)
+    assert "exports: usd (1 of 2 shots, see its notes), json\n" in capsys.readouterr().out
 
 
 @pytest.mark.slow

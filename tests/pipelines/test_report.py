@@ -87,6 +87,17 @@ def test_summary_says_range_error_and_cure_in_words(tmp_path: Path) -> None:
     assert "zoom ×1.7" in page.text
 
 
+def test_a_bridged_frame_of_a_relative_shot_has_no_camera(tmp_path: Path) -> None:
+    table = fake_table()
+    status = list(table.status)
+    status[-1] = "interpolated"  # shot 1 is relative: no focal length in it
+    table = dataclasses.replace(
+        table, status=tuple(status), f_px=np.where(table.frame == 7, table.f_px, np.nan)
+    )
+    page = build(tmp_path, fake_run(table), table)
+    assert "1 frame (0.2 %) has a calibrated camera; 376 frames with zoom and motion only" in page.text
+
+
 def test_each_status_of_the_run_is_named_signed_and_patterned(tmp_path: Path) -> None:
     table = fake_table()
     page = build(tmp_path, fake_run(table), table)

@@ -100,6 +100,15 @@ def test_the_panorama_finds_the_frame_that_looks_there(browser: Browser, report:
     assert found == sorted(found) and len(set(found)) == 3
 
 
+def test_a_frame_without_a_camera_has_no_outline(browser: Browser, report: str) -> None:
+    page = browser.open(report)
+    page.hover("#strip", (56 + 0.315 * 1070) / 1140)  # fake_table: lost from 30 to 33 %
+    now = state(page)
+    assert "lost" in now["words"] and now["outline"] == ""
+    page.hover("#strip", (56 + 0.2 * 1070) / 1140)
+    assert state(page)["outline"] != ""
+
+
 def test_keys_step_and_the_slider_can_be_focused(browser: Browser, report: str) -> None:
     page = browser.open(report)
     start = state(page)["slider"]

@@ -259,7 +259,8 @@
     svg.innerHTML = frames.filter((_, k) => k % step === 0).map((f) => '<polygon class="faint" points="' + points(f) + '"/>').join("") +
       '<polygon class="halo"/><polygon class="now"/>';
     listeners.push((row) => {
-      const here = data.shot[row] === shot, frame = data.frame[row];
+      // A frame without a camera has no place in the panorama, whatever its neighbours have.
+      const here = data.shot[row] === shot && C.zoom_ratio[row] !== null, frame = data.frame[row];
       const near = here && nearest(frames, frame);
       svg.querySelectorAll(".halo, .now").forEach((polygon) => polygon.setAttribute("points", here ? points(near) : ""));
     });
