@@ -41,6 +41,8 @@ INDIRECT_FORMATS = frozenset(
 )
 
 # FFmpeg plays a text file as a picture of a terminal.
+TS_PACKET, TS_SYNC = 188, 0x47  # bytes, first byte of a transport packet
+CUT_SHORT_S = 0.3  # of the duration that the header promises; sound often runs on for a frame or two
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf"})
 
 
@@ -182,6 +184,13 @@ class ContainerSource:
         found = list(self.warnings)
         if self.n_frames_header is not None and self.n_frames_header != n_decoded:
             found.append(f"the header promises {self.n_frames_header} frames, {n_decoded} could be decoded")
+        missing_s = self.duration_s - (n_decoded + self.n_failed) / self.fps
+        if self.n_frames_header is None and missing_s > max(CUT_SHORT_S, 0.02 * self.duration_s):
+            found.append(
+                f"truncated: the header promises {self.duration_s:.2f} s, the last {missing_s:.2f} s are missing"
+            )
+        if self.container_name == "mpegts" and _ends_within_packet(self.path):
+            found.append("truncated: it ends within a transport packet; what came before is used")
         if self.n_failed:
             found.append(f"{self.n_failed} damaged packets were left out")
         if self._n_other_size:
@@ -199,6 +208,14 @@ class ContainerSource:
                 if found is not None:
                     return found
         return None
+
+
+def _ends_within_packet(path: Path) -> bool:
+    """Whether a transport stream of 188-byte packets was cut: recorders write whole packets."""
+    with path.open("rb") as stream:
+        head = stream.read(2 * TS_PACKET)
+    aligned = len(head) == 2 * TS_PACKET and head[0] == head[TS_PACKET] == TS_SYNC
+    return aligned and path.stat().st_size % TS_PACKET != 0
 
 
 class ImageSource:

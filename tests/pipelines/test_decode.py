@@ -275,12 +275,17 @@ def test_damage_in_the_middle_does_not_end_the_clip(tmp_path: Path) -> None:
     assert any("damaged packets" in w or "header promises" in w for w in clip.facts.warnings)
 
 
-def test_what_is_left_of_a_truncated_stream_is_used(tmp_path: Path) -> None:
-    path = write_clip(tmp_path / "a.mkv", 20, size=(320, 240))
+@pytest.mark.parametrize(("name", "codec"), [("a.mkv", "ffv1"), ("a.ts", "mpeg2video")])
+def test_what_is_left_of_a_truncated_stream_is_used_and_said(tmp_path: Path, name: str, codec: str) -> None:
+    path = write_clip(tmp_path / name, 60, size=(320, 240), codec=codec)
     whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * 6 // 10])
-    _, frames = decode(path)
-    assert 5 < len(frames) < 20
+    clip, frames = decode(path)
+    assert len(frames) == 60
+    assert not any("truncated" in w for w in clip.facts.warnings)
+    path.write_bytes(whole[: len(whole) * 7 // 10 - 7])
+    clip, frames = decode(path)
+    assert 5 < len(frames) < 60
+    assert any("truncated" in w for w in clip.facts.warnings)
 
 
 def broken_inputs(folder: Path) -> dict[str, tuple[Path, str]]:
