@@ -47,9 +47,11 @@ def export_run(
     *,
     options: ExportOptions | None = None,
     shots: Sequence[int] | None = None,
+    source: Path | None = None,
 ) -> list[Exported]:
     """Write every named export of the shots (None: all) under OUT, at the places that formats.py states.
 
+    source: folder of the run, whose panorama.json a Hugin project takes its canvas from; None = `out`.
     Raises ValueError: no such format; MissingToolError: an extra is missing; InputError: no such shot, or a format that
     cannot hold this camera; OSError: not writable.
     """
@@ -60,8 +62,11 @@ def export_run(
             results.append(export_table(form, run, table, out / form.file))
             continue
         for cameras in chosen_shots(run, table, options, shots):
-            path = out / f"shot-{cameras.shot:03d}" / form.file
-            results.append(export_shot(form, cameras, path, table, options))
+            folder = f"shot-{cameras.shot:03d}"
+            canvas = (source or out) / folder / "panorama.json"
+            results.append(
+                export_shot(form, cameras, out / folder / form.file, table, options, panorama_json=canvas)
+            )
     return results
 
 

@@ -36,7 +36,7 @@ def export_folder(
     place = Path(target) if target is not None else out
     try:
         if target is None or place.is_dir() or len(names) > 1:
-            results = export_run(run, table, names, place, options=options, shots=shots)
+            results = export_run(run, table, names, place, options=options, shots=shots, source=out)
         else:
             results = _named(out, names[0], place, options, shots)
     except OSError as error:
@@ -58,7 +58,7 @@ def _named(
     # Shots without a camera give no file, so one file is enough when only one shot has any.
     having = [cameras for cameras in found if len(cameras.rows)] or found[:1]
     if len(having) > 1:
-        return export_run(run, table, [name], path, options=options, shots=shots)
+        return export_run(run, table, [name], path, options=options, shots=shots, source=out)
     panorama = out / f"shot-{having[0].shot:03d}" / "panorama.json"
     return [export_shot(form, having[0], path, table, options, panorama_json=panorama)]
 

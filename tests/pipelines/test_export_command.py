@@ -79,6 +79,28 @@ def test_one_export_of_one_shot_takes_the_path_as_its_name(tmp_path: Path) -> No
     assert (out / "run.json").read_bytes() == before, "what lies elsewhere is not the run's"
 
 
+def test_a_hugin_project_elsewhere_keeps_the_runs_canvas(tmp_path: Path) -> None:
+    out = finished(tmp_path / "out")
+    (out / "shot-000").mkdir()
+    facts = {
+        "format": "broadcast-mosaic panorama 1", "projection": "cylindrical", "size_px": [900, 400],
+        "centre_px": [449.5, 199.5], "scale_px_per_rad": 800.0,
+    }  # fmt: skip
+    (out / "shot-000" / "panorama.json").write_text(json.dumps(facts))
+    for path in (tmp_path / "a.pto", tmp_path / "folder" / "b.pto", None):
+        place = [] if path is None else ["-o", str(path)]
+        assert cli.main(["export", str(out), "--to", "pto", "--shot", "0", *place]) == 0
+        text = (path or out / "shot-000" / "cameras.pto").read_text()
+        assert "\np f1 w900 h400 " in text
+    several = ["-o", str(tmp_path / "several")]
+    assert cli.main(["export", str(out), "--to", "pto,usd", "--shot", "0", *several]) == 0
+    assert "\np f1 w900 h400 " in (tmp_path / "several" / "shot-000" / "cameras.pto").read_text()
+    (out / "shot-000" / "panorama.json").unlink()
+    assert cli.main(["export", str(out), "--to", "pto", "--shot", "0"]) == 0
+    turn = (out / "shot-000" / "cameras.pto").read_text().split("\np ")[1].split()
+    assert turn[0] == "f2" and int(turn[1][1:]) == 2 * int(turn[2][1:]) and turn[3] == "v360.0"
+
+
 def test_a_shot_without_a_focal_length_exits_1_and_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
