@@ -48,17 +48,13 @@ class Browser:
         assert program is not None, "chromium is not installed"
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        # The browser takes commands on 3 and answers on 4: copies far above them first, so that none is overwritten.
+        # The browser takes commands on 3 and answers on 4: copies far above them first, so that none is overwritten. A
+        # shell moves them, because Python may not run code of its own between fork and exec beside other threads.
         high = [fcntl.fcntl(fd, fcntl.F_DUPFD, 50) for fd in (to_read, to_write)]
-
-        def place() -> None:
-            os.dup2(high[0], 3)
-            os.dup2(high[1], 4)
-
+        move = f'exec "$0" "$@" 3<&{high[0]} 4>&{high[1]} {high[0]}<&- {high[1]}>&-'
         self._process = subprocess.Popen(
-            [program, *FLAGS, f"--user-data-dir={folder / 'profile'}"],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            pass_fds=(3, 4), preexec_fn=place,
+            ["bash", "-c", move, program, *FLAGS, f"--user-data-dir={folder / 'profile'}"],
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=high,
         )  # fmt: skip
         for fd in (to_read, to_write, *high):
             os.close(fd)
