@@ -26,7 +26,7 @@ from pipelines.exports.whole_file import whole_folder
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.records import CameraTable
 from pipelines.summary import print_summary
-from tests.pipelines.end_to_end import one_line, run
+from tests.pipelines.end_to_end import digests, one_line, run
 from tests.pipelines.export_readers import decode_freed
 from tests.pipelines.export_truth import FIRST, LOST, N, Truth, truth
 
@@ -264,6 +264,10 @@ def test_run_writes_the_exports_it_is_asked_for(pan_clip: Path, tmp_path: Path) 
     assert read_run(done.out).config["output"]["exports"] == ["chan", "pto", "colmap-bin"]
     lines = (done.out / "shot-000/camera.chan").read_text().splitlines()
     assert len(lines) == np.isfinite(table.f_px).sum() > 40
+    # Afterwards, from the folder alone, the same bytes.
+    before = digests(done.out / "shot-000")
+    assert cli.main(["export", str(done.out), "--to", "chan,pto,colmap-bin"]) == 0
+    assert digests(done.out / "shot-000") == before
 
 
 # ---- folders that are whole
