@@ -15,15 +15,16 @@ import numpy as np
 from markupsafe import Markup
 
 MAX_ARCS = 500  # drawn; more are a grey area, and 60 bytes each
-WIDTH, HEIGHT, MARGIN = 1000, 150, 12
+WIDTH, HEIGHT, MARGIN = 1000, 130, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraphDrawing:
-    """An inline SVG and what it shows in words, for those who do not see it."""
+    """An inline SVG of any width, what it shows in words, and the frames at its two ends."""
 
     svg: Markup
     words: str
+    frames: tuple[int, int]
 
 
 def registration_graph(path: Path, keyframes: Sequence[int]) -> GraphDrawing | None:
@@ -43,7 +44,7 @@ def registration_graph(path: Path, keyframes: Sequence[int]) -> GraphDrawing | N
     first, last = int(keys[0]), int(keys[-1])
     scale = (WIDTH - 2 * MARGIN) / max(last - first, 1)
     longest = int(np.abs(dst - src).max())
-    base = HEIGHT - 22
+    base = HEIGHT - 7
 
     def x(frame: int) -> float:
         return round(MARGIN + (frame - first) * scale, 1)
@@ -57,10 +58,6 @@ def registration_graph(path: Path, keyframes: Sequence[int]) -> GraphDrawing | N
             f'<path class="g-{_class(str(status[i]))}" d="M{x(a)} {base}C{x(a)} {top} {x(b)} {top} {x(b)} {base}"/>'
         )
     ticks = [f'<line x1="{x(k)}" y1="{base}" x2="{x(k)}" y2="{base + 5}"/>' for k in keys.tolist()]
-    ends = [
-        f'<text x="{x(first)}" y="{HEIGHT - 3}">{first}</text>',
-        f'<text x="{x(last)}" y="{HEIGHT - 3}" text-anchor="end">{last}</text>',
-    ]
     drawn = "" if len(every) == len(src) else f"; {len(every)} of them drawn"
     words = (
         f"{len(src)} pairs between {len(keys)} keyframes: "
@@ -68,11 +65,11 @@ def registration_graph(path: Path, keyframes: Sequence[int]) -> GraphDrawing | N
         + drawn
     )
     svg = (
-        f'<svg class="graph" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{words}">'
+        f'<svg class="graph" viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none" role="img" aria-label="{words}">'
         f'<line class="g-axis" x1="{MARGIN}" y1="{base}" x2="{WIDTH - MARGIN}" y2="{base}"/>'
-        f"{''.join(arcs)}{''.join(ticks)}{''.join(ends)}</svg>"
+        f"{''.join(arcs)}{''.join(ticks)}</svg>"
     )
-    return GraphDrawing(svg=Markup(svg), words=words)
+    return GraphDrawing(svg=Markup(svg), words=words, frames=(first, last))
 
 
 def _class(status: str) -> str:

@@ -153,6 +153,11 @@ def test_nothing_is_cut_off_or_invisible(browser: Browser, report: str, view: di
     page = browser.open(report, **view)
     page.settle()
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    page.hover("#strip", 0.9)  # relative: the longest words
+    assert "zooms" in state(page)["words"]
+    assert page.evaluate(
+        "[...document.querySelectorAll('#readout span')].every((e) => e.getBoundingClientRect().right <= innerWidth)"
+    )
     # Text against what lies behind it: WCAG asks for 4.5.
     worst = page.evaluate(
         """(() => { const rgb = (c) => c.match(/[\\d.]+/g).map(Number);
