@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import homography
 from calib.camera import N_SHARED
-from calib.problem import Loss, Packed, PriorTerms, State, residuals, whitened_squares
+from calib.problem import Loss, Packed, PriorTerms, State, chunks, residuals, whitened_squares
 from calib.records import Lens, Priors, Solution, StartResult
 from calib.solver import Layout, NormalEquations, Result
 
@@ -22,8 +22,11 @@ Array = NDArray[np.float64]
 KAPPA_PRIOR, KAPPA_PRIOR_EDGES = 4.0, 4.0
 
 
-def homography_directions(packed: Packed, state: State) -> Array:
-    """Orthonormal bases (E, 2 m, 8) of the whitened residual directions that a change of an edge's homography makes."""
+def homography_energy(packed: Packed, whitened: Array) -> Array:
+    """Squared length (E,) of whitened residuals (E, 2 m) within what a change of each edge's homography could make.
+
+    That is at most eight directions; those that the points do not span count for nothing.
+    """
     a, _, root = packed.points()
     E, m = packed.dof.shape
     H = np.where(np.isfinite(packed.H), packed.H, np.eye(3))
@@ -31,12 +34,15 @@ def homography_directions(packed: Packed, state: State) -> Array:
     T = np.array([[1 / W, 0, -0.5], [0, 1 / W, -0.5 * packed.size_px[1] / W], [0, 0, 1]])
     points = homography.apply(T, a)
     J = homography.point_jacobian(T @ H @ np.linalg.inv(T), points) * W
-    # Whiten; an SVD keeps the 8 (or fewer) directions that the points span.
     J = np.where(np.isfinite(J), J, 0.0)
     J = (root @ J * (packed.dof > 0)[..., None, None]).reshape(E, 2 * m, 9)
-    U, s, _ = np.linalg.svd(J, full_matrices=False)
-    keep = s[:, :8] > 1e-7 * s[:, :1]
-    return U[:, :, :8] * keep[:, None, :]
+    # The smallest of the nine directions is the scale of H, which moves nothing; a Gram matrix of nine columns costs a
+    # tenth of a decomposition of 2 m rows.
+    values, vectors = np.linalg.eigh(np.swapaxes(J, 1, 2) @ J)
+    values, vectors = values[:, 1:], vectors[:, :, 1:]
+    along = np.swapaxes(vectors, 1, 2) @ (np.swapaxes(J, 1, 2) @ whitened[..., None])
+    keep = values > 1e-11 * values[:, -1:]
+    return np.sum(np.where(keep, along[..., 0] ** 2 / np.where(keep, values, 1.0), 0.0), 1)
 
 
 def edge_statistics(packed: Packed, state: State, loss: Loss) -> tuple[Array, Array, Array, Array]:
@@ -44,6 +50,17 @@ def edge_statistics(packed: Packed, state: State, loss: Loss) -> tuple[Array, Ar
 
     and rms px of the residual (weighted by robust weights). NaN for edges without known points or impossible ones.
     """
+    parts = [
+        _statistics(packed.select(part), state, loss)
+        for part in chunks(packed.n_edges, 1, packed.dof.shape[1])
+    ]
+    if not parts:
+        return np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)
+    chi2, kappa, smooth, rms = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return chi2, kappa, smooth, rms
+
+
+def _statistics(packed: Packed, state: State, loss: Loss) -> tuple[Array, Array, Array, Array]:
     rx, ry, _ = residuals(packed, state)
     rx, ry = rx[0], ry[0]
     ex, ey = packed.s11 * rx + packed.s12 * ry, packed.s12 * rx + packed.s22 * ry
@@ -56,11 +73,9 @@ def edge_statistics(packed: Packed, state: State, loss: Loss) -> tuple[Array, Ar
     dof = packed.dof.sum(1)
     with np.errstate(all="ignore"):
         chi2 = np.sum(weight * e2, 1) / np.maximum(dof, 1)
-        basis = homography_directions(packed, state)
         root = np.sqrt(weight)
         whitened = np.stack([ex * root, ey * root], -1).reshape(len(dof), -1)
-        inside = np.einsum("epk,ep->ek", basis, whitened)
-        energy = np.sum(inside**2, 1)
+        energy = homography_energy(packed, whitened)
         kappa = energy / 8
         # The part of the energy that noise of the observed level (outside these directions) would not explain.
         floor = np.maximum(np.sum(whitened**2, 1) - energy, 0) / np.maximum(dof - 8, 1)
@@ -76,18 +91,23 @@ def edge_statistics(packed: Packed, state: State, loss: Loss) -> tuple[Array, Ar
     return chi2, kappa, smooth_px, rms
 
 
-def perspective_signal(packed: Packed, state: State, layout: Layout, covariance: Array, u: Array) -> float:
-    """S10: rms px that the best edge moves when mean log f is forced by 0.1 and everything else re-optimises."""
-    direction = covariance @ u
+def perspective_signal(packed: Packed, state: State, layout: Layout, direction: Array, u: Array) -> float:
+    """S10: rms px that the best edge moves when mean log f = u . x is forced by 0.1 and all else re-optimises.
+
+    direction: covariance times u.
+    """
     denominator = float(u @ direction)
     if not np.isfinite(denominator) or denominator <= 0:
         return 0.0
     a = (0.1 * direction / denominator)[layout.columns]  # (E, 13)
-    _, _, J = residuals(packed, state, jacobian=True)
-    moved = np.einsum("ejcm,ej->ecm", J[0], a)
-    known = packed.dof > 0
-    square = np.where(known, np.sum(moved**2, 1), 0.0).sum(1) / np.maximum(known.sum(1), 1)
-    return float(np.sqrt(np.nanmax(square, initial=0.0)))
+    best = 0.0
+    for part in chunks(packed.n_edges, 1, packed.dof.shape[1]):
+        _, _, J = residuals(packed, state, part, jacobian=True)
+        moved = np.einsum("ejcm,ej->ecm", J[0], a[part])
+        known = packed.dof[part] > 0
+        square = np.where(known, np.sum(moved**2, 1), 0.0).sum(1) / np.maximum(known.sum(1), 1)
+        best = max(best, float(np.nanmax(square, initial=0.0)))
+    return float(np.sqrt(best))
 
 
 def summarise(
@@ -117,32 +137,36 @@ def summarise(
     s10, factor = 0.0, 1.0
     converged = bool(result.converged[0])
     try:
-        covariance = NormalEquations(layout, terms, state, result.lin).covariance()
-        if not np.isfinite(covariance).all() or (np.diagonal(covariance) < 0).any():
+        parts = NormalEquations(layout, terms, state, result.lin).covariance_parts()
+        blocks, shared = parts.frame_blocks(), parts.shared_variances()
+        variances = np.concatenate([np.diagonal(blocks, axis1=1, axis2=2).ravel(), shared])
+        if not np.isfinite(variances).all() or (variances < 0).any():
             raise np.linalg.LinAlgError("covariance is not positive")
-        u = np.zeros(layout.size)
+        u, first = np.zeros(layout.size), np.zeros(layout.size)
         u[0 : 4 * n : 4] = linked / linked.sum()
-        formal = float(np.sqrt(u @ covariance @ u))
-        sigma_mean = _cluster_sigma(covariance, u, layout, terms, result, kappa[ok], chi2_dof, n_free)
-        s10 = perspective_signal(used, state, layout, covariance, u)
+        first[4 * row] = 1.0
+        mean, zoom = parts.product(u), parts.product(first)
+        if not float(u @ mean) > 0:
+            raise np.linalg.LinAlgError("covariance is not positive")
+        formal = float(np.sqrt(u @ mean))
+        sigma_mean = _cluster_sigma(mean, u, layout, terms, result, kappa[ok], chi2_dof, n_free)
+        s10 = perspective_signal(used, state, layout, mean, u)
         factor = max(sigma_mean / formal, 1.0) if formal > 0 else 1.0
-        lam = np.arange(0, 4 * n, 4)
-        variance = np.diagonal(covariance)
-        sigma_log_f = np.sqrt(variance[lam]) * factor
-        relative = variance[lam] + variance[4 * row] - 2 * covariance[lam, 4 * row]
+        sigma_log_f = np.sqrt(blocks[:, 0, 0]) * factor
+        relative = blocks[:, 0, 0] + blocks[row, 0, 0] - 2 * zoom[0 : 4 * n : 4]
         sigma_zoom = np.sqrt(np.maximum(relative, 0)) * factor
-        for k in range(n):
-            cov_rot[k] = covariance[4 * k + 1 : 4 * k + 4, 4 * k + 1 : 4 * k + 4] * factor**2
+        cov_rot = blocks[:, 1:, 1:] * factor**2
         lens_std = {
-            name: float(np.sqrt(variance[4 * n + k])) * factor if layout.active[4 * n + k] else 0.0
+            name: float(np.sqrt(shared[k])) * factor if layout.active[4 * n + k] else 0.0
             for k, name in enumerate(("pp_x", "pp_y", "log_aspect", "c0", "c1"))
         }
     except np.linalg.LinAlgError:
         converged = False
     rms = np.full(n, np.nan)
-    for k in range(n):
-        mine = ok & ((packed.ia == k) | (packed.ib == k)) & np.isfinite(rms_edge)
-        rms[k] = np.sqrt(np.mean(rms_edge[mine] ** 2)) if mine.any() else np.nan
+    good = ok & np.isfinite(rms_edge)
+    ends = np.concatenate([packed.ia[good], packed.ib[good]])
+    total, count = np.bincount(ends, np.tile(rms_edge[good] ** 2, 2), n), np.bincount(ends, minlength=n)
+    rms[count > 0] = np.sqrt(total[count > 0] / count[count > 0])
     log_f, R = state.log_f[0].copy(), state.R[0].copy()
     for values in (log_f, R, sigma_log_f, sigma_zoom, cov_rot, rms):
         values[~linked] = np.nan
@@ -157,7 +181,7 @@ def summarise(
 
 
 def _cluster_sigma(
-    covariance: Array,
+    a: Array,
     u: Array,
     layout: Layout,
     terms: PriorTerms,
@@ -166,8 +190,10 @@ def _cluster_sigma(
     chi2_dof: float,
     n_free: int,
 ) -> float:
-    """sigma of u^T x: sandwich over edges plus priors, never below the chi2-scaled formal value; few edges: kappa."""
-    a = covariance @ u
+    """sigma of u^T x: sandwich over edges plus priors, never below the chi2-scaled formal value; few edges: kappa.
+
+    a: covariance times u.
+    """
     E = len(layout.columns)
     per_edge = np.einsum("ej,ej->e", a[layout.columns], result.lin.gradient[0])
     spare = 8 * E - n_free
@@ -177,7 +203,7 @@ def _cluster_sigma(
     )
     prior += float((a[0 : 4 * layout.n : 4].mean()) ** 2 * terms.mean_precision)
     prior += float(np.sum(a[4 * terms.known_row] ** 2 * terms.known_precision))
-    formal = float(u @ covariance @ u)
+    formal = float(u @ a)
     data = max(formal - prior, 0.0)
     chi2 = max(chi2_dof, 1.0)
     observed = float(np.nansum(kappa)) * 8
@@ -191,4 +217,4 @@ def _cluster_sigma(
     return float(np.sqrt(max(from_kappa, data * chi2 + prior)))
 
 
-__all__ = ["N_SHARED", "edge_statistics", "homography_directions", "perspective_signal", "summarise"]
+__all__ = ["N_SHARED", "edge_statistics", "homography_energy", "perspective_signal", "summarise"]

@@ -17,6 +17,7 @@ from calib.covariance import edge_statistics
 from calib.problem import Loss, Packed, State, linearise, pack, robust_scale, whitened_squares
 from calib.records import HomographyGraph, Solution
 from calib.refine import find_bad_edges, linked_to, state_from_solution
+from calib.selected_inverse import inverse_diagonal_blocks
 
 Array = NDArray[np.float64]
 MAX_BAND = 12  # frames: links between free frames that reach further get their error bars from single solves
@@ -76,36 +77,6 @@ class _PoseSystem:
         rows, cols = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
         values = np.concatenate([p[2].ravel() for p in parts])
         return sp.coo_array((values, (rows, cols)), shape=(self.size, self.size)).tocsc()
-
-
-def inverse_diagonal_blocks(A: sp.csc_array, band: int) -> Array:
-    """4 x 4 diagonal blocks (n, 4, 4) of A^-1 for a block-banded positive matrix, links up to `band` blocks apart.
-
-    Two-way block recursion (calibration.md 6.6), O(n band^2). Raises numpy.linalg.LinAlgError when singular.
-    """
-    n = A.shape[0] // 4
-    size = 4 * band
-    starts = list(range(0, 4 * n, size))
-    stops = [min(s + size, 4 * n) for s in starts]
-    A = A.tocsr()
-    T: list[Array] = []
-    X: list[Array] = []
-    for k, (s, e) in enumerate(zip(starts, stops, strict=True)):
-        block = A[s:e, s:e].toarray()
-        if k:
-            U = A[starts[k - 1] : s, s:e].toarray()
-            gain = np.linalg.solve(T[-1], U)
-            X.append(gain)
-            block = block - U.T @ gain
-        T.append(block)
-    out = np.zeros((n, 4, 4))
-    P: Array = np.zeros((0, 0))
-    for k in range(len(starts) - 1, -1, -1):
-        inverse = np.linalg.inv(T[k])
-        P = np.asarray(inverse if k == len(starts) - 1 else inverse + X[k] @ P @ X[k].T)
-        for j in range((stops[k] - starts[k]) // 4):
-            out[starts[k] // 4 + j] = P[4 * j : 4 * j + 4, 4 * j : 4 * j + 4]
-    return out
 
 
 def _iterate(

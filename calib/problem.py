@@ -17,9 +17,9 @@ from calib.dlt import square_root_information
 from calib.records import HomographyEdge, HomographyGraph, Priors
 
 Array = NDArray[np.float64]
-CHUNK_POINTS = (
-    60_000  # points linearised at once: keeps the working set of ~100 arrays inside a few tens of MB
-)
+# Points linearised at once: ~100 arrays of them are the working set (measured: 90 ms for 156,000 points at 8,000 to
+# 20,000, 140 ms at 60,000, 150 ms at 2,000).
+CHUNK_POINTS = 16_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,7 +54,7 @@ class Packed:
         """log W."""
         return float(np.log(self.size_px[0]))
 
-    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Packed:
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Packed:
         """The same frames with some of the edges."""
         return Packed(
             ia=self.ia[keep], ib=self.ib[keep], a_x=self.a_x[keep], a_y=self.a_y[keep], b_x=self.b_x[keep],
@@ -183,7 +183,8 @@ class Loss:
         return np.where(far, 2 * k * e - k * k, e2), np.where(far, k / np.where(far, e, 1.0), 1.0)
 
 
-def _chunks(n_edges: int, n_starts: int, m: int) -> list[slice]:
+def chunks(n_edges: int, n_starts: int, m: int) -> list[slice]:
+    """Slices of edges of about CHUNK_POINTS points each."""
     size = max(1, CHUNK_POINTS // max(1, n_starts * m))
     return [slice(k, min(k + size, n_edges)) for k in range(0, n_edges, size)]
 
@@ -211,7 +212,7 @@ def whitened_squares(packed: Packed, state: State) -> Array:
     """Squared whitened residuals e2 (S, E, m); inf where a point cannot be transferred."""
     out = np.empty((len(state.log_f), packed.n_edges, packed.dof.shape[1]))
     with np.errstate(all="ignore"):
-        for part in _chunks(*out.shape[1::-1], out.shape[2]):
+        for part in chunks(*out.shape[1::-1], out.shape[2]):
             rx, ry, _ = residuals(packed, state, part)
             s11, s12, s22 = packed.s11[part], packed.s12[part], packed.s22[part]
             e2 = (s11 * rx + s12 * ry) ** 2 + (s12 * rx + s22 * ry) ** 2
@@ -238,7 +239,7 @@ def linearise(packed: Packed, state: State, loss: Loss, *, pose_only: bool = Fal
     blocks, gradient = np.empty((S, E, n_columns, n_columns)), np.empty((S, E, n_columns))
     e2_all, cost = np.empty((S, E, m)), np.zeros(S)
     with np.errstate(all="ignore"):
-        for part in _chunks(E, S, m):
+        for part in chunks(E, S, m):
             rx, ry, J = residuals(packed, state, part, jacobian=True, pose_only=pose_only)
             s11, s12, s22 = packed.s11[part], packed.s12[part], packed.s22[part]
             known = packed.dof[part] > 0

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from calib import linear
 from calib.covariance import summarise
@@ -33,6 +33,12 @@ Array = NDArray[np.float64]
 # The loss scale is the fixed point of fit and median residual, so that it does not depend on where a fit began.
 MAX_LOOKS = 10
 WORST_FIRST = 0.4
+SCOUT_ABOVE = (
+    140  # frames: beyond it the starts are tried on some of the frames, the rest is chained on (dense solver)
+)
+N_SCOUTS = 100
+THIN_ABOVE = 200_000  # points
+WARM_DAMPING = 1e-7  # beside an optimum: full steps, and damping only where one fails
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -362,6 +368,14 @@ def refine(
         )
         return _spread(refine(part, start=start, priors=priors, options=options), graph, inside)
     packed = everything.select(inside)
+    if start is None and packed.n_frames > SCOUT_ABOVE:
+        chosen = frames[scouts(packed, row)]
+        first = refine(
+            graph.subgraph(chosen), priors=priors, options=replace(options, reference=reference_frame)
+        )
+        if np.isfinite(first.log_f).sum() >= 2:
+            whole = refine(graph, start=first, priors=priors, options=options)
+            return replace(whole, starts=first.starts, linear_valid=first.linear_valid)
     prior_args = (priors, graph.size_px)
     starts: tuple[StartResult, ...] = ()
     share = float("nan")
@@ -391,11 +405,18 @@ def polish(
 ) -> tuple[Result, NDArray[np.bool_], Loss]:  # fmt: skip
     """Re-estimate scale and bad edges around one state until both stay, then iterate to the end."""
     n_steps, tried = 0, np.zeros(packed.n_edges, bool)
+    # Thousands of frames: a quarter of the points brings them as near as the last steps on all points need.
+    large = packed.n_edges * packed.dof.shape[1] > THIN_ABOVE
+    layout, of = Layout(packed.select(ok), row, free), ok
     for look in range(MAX_LOOKS):
         loss = Loss("huber", scale, options.huber)
+        chosen = packed.select(ok)
+        chosen = chosen.thin(options.thin) if large else chosen
+        if (of != ok).any():
+            layout, of = Layout(chosen, row, free), ok
         rough = minimise(
-            packed.select(ok), Layout(packed.select(ok), row, free), terms, state, loss,
-            max_steps=options.max_steps, tolerance=1e-6,
+            chosen, layout, terms, state, loss, max_steps=options.max_steps, tolerance=1e-6,
+            damping0=1e-4 if look == 0 else WARM_DAMPING,
         )  # fmt: skip
         n_steps += int(rough.n_steps[0])
         state = rough.state
@@ -415,10 +436,11 @@ def polish(
         scale = new_scale
     loss = Loss(options.robust, scale, options.huber)
     chosen = packed.select(ok)
-    layout = Layout(chosen, row, free)
+    layout = layout if (of == ok).all() else Layout(chosen, row, free)
     result = minimise(
-        chosen, layout, terms, state, loss, max_steps=options.max_steps, tolerance=options.tolerance
-    )
+        chosen, layout, terms, state, loss, max_steps=options.max_steps, tolerance=options.tolerance,
+        damping0=WARM_DAMPING,
+    )  # fmt: skip
     result.n_steps[0] += n_steps
     return result, ok, loss
 
@@ -442,6 +464,24 @@ def linked_pairs(packed: Packed, ok: NDArray[np.bool_], row: int) -> NDArray[np.
     """Edges (E,) both of whose frames accepted edges join to the reference."""
     linked = linked_frames(packed, ok, row)
     return linked[packed.ia] & linked[packed.ib]
+
+
+def scouts(packed: Packed, row: int) -> NDArray[np.int64]:
+    """Rows of N_SCOUTS frames, the reference row among them, that edges join to each other: those with most edges.
+
+    In a graph of all frames these are the keyframes. Where they do not hang together, those nearest to the reference.
+    """
+    n = packed.n_frames
+    degree = np.bincount(np.concatenate([packed.ia, packed.ib]), minlength=n).astype(float)
+    degree[row] = np.inf
+    inside = np.zeros(n, bool)
+    inside[np.argsort(-degree, kind="stable")[:N_SCOUTS]] = True
+    joined = linked_frames(packed, inside[packed.ia] & inside[packed.ib], row)
+    if (joined & inside).sum() < N_SCOUTS // 2:
+        link = coo_array((np.ones(packed.n_edges), (packed.ia, packed.ib)), shape=(n, n)).tocsr()
+        order, _ = breadth_first_order(link, row, directed=False)
+        return np.sort(order[:N_SCOUTS]).astype(np.int64)
+    return np.flatnonzero(joined & inside)
 
 
 def nothing(graph: HomographyGraph, priors: Priors, reference: int, stop: str) -> Solution:

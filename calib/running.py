@@ -41,7 +41,8 @@ class RunningOptions:
     window: keyframes adjusted together; linked: how many of them may be older ones with an edge into the recent ones.
     cold_at: keyframe counts at which the adjustment starts from scratch (multistart), so that an early wrong basin does
     not last. max_scale: robust residual scale, in stated sigmas, beyond which a frame's pose is refused.
-    keep_frames: recent poses kept so that edges may name them.
+    keep_frames: recent poses kept so that edges may name them. max_keyframes: the oldest but the first are forgotten
+    beyond it, so that memory and work stay bounded however long the shot.
     two_view_motion, two_view_growth: rms motion in widths, and its growth since, at which the first keyframe and the
     newest frame are calibrated from scratch while there is no second keyframe (.1 s each).
     """
@@ -51,6 +52,7 @@ class RunningOptions:
     cold_at: tuple[int, ...] = (2, 3, 5, 8, 13)
     max_scale: float = 8.0
     keep_frames: int = 8
+    max_keyframes: int = 512
     two_view_motion: float = 0.005
     two_view_growth: float = 1.25
     max_sigma: float = 0.1
@@ -111,7 +113,7 @@ class RunningCalibrator:
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """Frame numbers of all keyframes."""
+        """Frame numbers of the keyframes that are kept."""
         return tuple(self._keyframes)
 
     @property
@@ -231,14 +233,23 @@ class RunningCalibrator:
         old_anchor = _Pose(anchor.log_f, anchor.R)
         for k in rows:
             self._poses[window[k]] = _Pose(float(solution.log_f[k]), solution.R[k])
-        for f in self._keyframes:
-            if f not in members:
-                # The rest follows the common focal: log f by the shift, angles to the window by its inverse.
-                pose = self._poses[f]
-                turn = rotation.log(pose.R @ old_anchor.R.T) * math.exp(-shift)
-                self._poses[f] = _Pose(pose.log_f + shift, rotation.exp(turn) @ old_anchor.R)
+        rest = [f for f in self._keyframes if f not in members]
+        if rest:
+            # The rest follows the common focal: log f by the shift, angles to the window by its inverse.
+            turns = rotation.log(np.array([self._poses[f].R for f in rest]) @ old_anchor.R.T) * math.exp(
+                -shift
+            )
+            for f, R in zip(rest, rotation.exp(turns) @ old_anchor.R, strict=True):
+                self._poses[f] = _Pose(self._poses[f].log_f + shift, R)
         self._solution = self._regauge(solution)
         self._score(self._solution, graph)
+        # The first keyframe stays: its axes are the world's.
+        while len(self._keyframes) > max(self.options.max_keyframes, self.options.window + 1):
+            oldest = next((k for k in self._keyframes[1:] if k not in members), None)
+            if oldest is None:
+                break
+            self._keyframes.remove(oldest)
+            del self._poses[oldest]
         keep = set(self._keyframes[-2 * self.options.window :]) | members
         self._edges = [e for e in self._edges if e.a in keep and e.b in keep]
 
@@ -246,8 +257,9 @@ class RunningCalibrator:
         """World axes = axes of the first keyframe, also after it has followed a change of focal from outside."""
         turn = self._poses[self._keyframes[0]].R.T
         for poses in (self._poses, self._recent):
-            for f, pose in poses.items():
-                poses[f] = _Pose(pose.log_f, rotation.orthonormalise(pose.R @ turn), pose.anchors)
+            turned = rotation.orthonormalise(np.array([pose.R for pose in poses.values()]) @ turn)
+            for (f, pose), R in zip(list(poses.items()), turned, strict=True):
+                poses[f] = _Pose(pose.log_f, R, pose.anchors)
         self._poses[self._keyframes[0]].R = np.eye(3)
         return replace(solution, R=solution.R @ turn)
 

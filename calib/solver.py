@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib.camera import N_SHARED
 from calib.problem import Linearised, Loss, Packed, PriorTerms, State, linearise
+from calib.selected_inverse import DenseCovariance, SelectedCovariance
 
 Array = NDArray[np.float64]
 DENSE_BELOW = 600
@@ -47,6 +48,7 @@ class Layout:
         self.columns = np.concatenate([a, b, shared], 1)  # (E, 13)
         self.dense = 4 * n < DENSE_BELOW
         self._gather: sp.csr_array | None = None
+        self._pattern: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None = None
 
     def vector(self, per_edge: Array) -> Array:
         """Sum of per-edge vectors (S, E, 13) into (S, 4 n + 5)."""
@@ -63,6 +65,17 @@ class Layout:
             )
         out = self._gather @ blocks.reshape(len(blocks), -1).T
         return np.ascontiguousarray(out.T).reshape(-1, self.size, self.size)
+
+    def sparse(self, blocks: Array) -> sp.csc_array:
+        """Sum of one start's blocks (E, 13, 13) as a sparse matrix (4 n + 5, 4 n + 5); the pattern is made once."""
+        if self._pattern is None:
+            row, col = self.columns[:, :, None], self.columns[:, None, :]
+            keys, slot = np.unique((col * self.size + row).ravel(), return_inverse=True)
+            pointers = np.searchsorted(keys // self.size, np.arange(self.size + 1))
+            self._pattern = keys % self.size, pointers, slot
+        indices, pointers, slot = self._pattern
+        data = np.bincount(slot, blocks.ravel(), len(indices))
+        return sp.csc_array((data, indices, pointers), shape=(self.size, self.size))
 
 
 class NormalEquations:
@@ -100,14 +113,12 @@ class NormalEquations:
 
     def _sparse(self, lin: Linearised) -> None:
         layout = self.layout
-        cols, n, N = layout.columns, layout.n, layout.size
-        rows = np.repeat(cols, 13, axis=1).ravel()
-        full = sp.coo_array(
-            (lin.blocks[0].ravel(), (rows, np.tile(cols, (1, 13)).ravel())), shape=(N, N)
-        ).tocsc() + sp.diags_array(self.extra)
+        n, N = layout.n, layout.size
+        full = layout.sparse(lin.blocks[0]) + sp.diags_array(self.extra)
         keep = np.flatnonzero(layout.active)
         self.poses, self.lens = keep[keep < 4 * n], keep[keep >= 4 * n]
         full = full.tocsc()
+        self.full = full
         self.A = full[self.poses][:, self.poses].tocsc()
         u = (self.poses % 4 == 0).astype(float)[:, None]
         # The mean-log-f prior is rank one: as a bordered variable it keeps A sparse.
@@ -155,8 +166,19 @@ class NormalEquations:
         shared = np.linalg.solve(D - self.B.T @ YB, lower)
         return np.vstack([Yg - YB @ shared, shared[:k]])
 
+    def covariance_parts(self) -> DenseCovariance | SelectedCovariance:
+        """What error bars need of the inverse of the undamped matrix of the first start; linear in n when sparse.
+
+        Raises numpy.linalg.LinAlgError when singular.
+        """
+        layout = self.layout
+        if self.dense is not None:
+            return DenseCovariance(self.covariance(), layout.n)
+        ia, ib = layout.columns[:, 0] // 4, layout.columns[:, 4] // 4
+        return SelectedCovariance(self.full, layout.active, layout.n, ia, ib, self.mean_weight)
+
     def covariance(self, start: int = 0) -> Array:
-        """Inverse of the undamped matrix, (4 n + 5, 4 n + 5), zero rows for held unknowns. Dense: n up to ~1000.
+        """Inverse of the undamped matrix, (4 n + 5, 4 n + 5), zero rows for held unknowns: for small n, and tests.
 
         Raises numpy.linalg.LinAlgError when singular.
         """

@@ -17,7 +17,7 @@ from calib import (
     solve_poses,
 )
 from calib.gates import SENTENCES
-from calib.poses import inverse_diagonal_blocks
+from calib.selected_inverse import inverse_diagonal_blocks
 from tests.calib import tracks
 from tests.calib.test_refine import common_error, make
 

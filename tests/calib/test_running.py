@@ -141,3 +141,17 @@ def test_foreign_edges_are_a_mistake():
         cal.add_keyframe(0, [])
     with pytest.raises(ValueError):
         RunningCalibrator((1280, 720)).predict(0)
+
+
+def test_memory_is_bounded_and_the_world_stays_when_old_keyframes_are_forgotten():
+    options = RunningOptions(window=6, linked=2, max_keyframes=9, cold_at=(2, 3))
+    truth, cal, _, estimates = run(n=160, step=8, pan_deg=50, options=options)
+    assert len(cal.keyframes) == 9 and cal.keyframes[0] == 0 and cal.keyframes[-1] == 152
+    assert set(cal.keyframes) == set(cal.state()["keyframes"]) == {f for f, *_ in cal.state()["poses"]}
+    edges = cal.state()["edges"]
+    assert all(e["a"] in cal.keyframes and e["b"] in cal.keyframes for e in edges)
+    np.testing.assert_allclose(cal.pose(0)[1], np.eye(3), atol=1e-12)
+    assert cal.pose(8) is None
+    assert abs(estimates[-1].log_f - truth.log_f[-1]) < 0.02
+    turn = rotation.log(estimates[-1].R @ truth.R[-1].T)
+    assert np.linalg.norm(turn) < np.deg2rad(1.0)
