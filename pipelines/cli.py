@@ -388,7 +388,8 @@ class _CurrentStderr(logging.StreamHandler[Any]):
     """Writes to whatever stderr is now: progress bars put themselves in its place while they show."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.setStream(sys.stderr)
+        # Not setStream: that flushes the old stream, which may be closed by now. Every emit has flushed already.
+        self.stream = sys.stderr
         super().emit(record)
 
 
