@@ -234,7 +234,8 @@ def test_names_of_a_run_are_settings(tmp_path: Path) -> None:
 
 def test_a_run_without_a_camera_keeps_its_results(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     known = truth()
-    caplog.set_level(logging.WARNING, logger="pipelines")  # a command before this one may have asked for quiet
+    # A command before this one may have asked for quiet.
+    caplog.set_level(logging.WARNING, logger="pipelines")
     export_for_run(known.run(), no_camera(), ("usd", "json", "chan"), tmp_path)
     assert (tmp_path / "camera.json").is_file()
     assert [r.levelname for r in caplog.records] == ["WARNING"] * 2
