@@ -25,7 +25,7 @@ from mosaic.tiles import Layers, Scene, paint
 from mosaic.views import Lattice
 
 SMALL_WIDTH_PX = 320  # frames are compared at about this width
-DISTRUSTED = 3  # of 255: what seems to move still counts where nothing else is there
+DISTRUSTED = 2  # of 255: what seems to move still counts where nothing else is there
 DIFFERENT_GREY = (
     14.0  # a difference beyond this and 2 x the spread of the views is one; codec noise of a mean is 2..4
 )
@@ -41,7 +41,7 @@ GROUND_PX, GROUND_SHRINK = (
     4,
 )  # small px: side of the neighbourhood, and the reduction at which it is looked at
 PLAIN_GREY = 16.0  # usual distance from the ground round about, above which that is no plain ground
-HALO, LIFTED = 24, 100  # trust close round what moves; and there where the colour is that of the plain ground
+HALO, LIFTED = 8, 150  # trust close round what moves; and there where the colour is that of the plain ground
 MOMENT_FRAMES = 6  # views nearer than this say the same about a place
 STEP_PX = 16  # spacing of exact map points in the small frame
 
