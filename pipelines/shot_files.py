@@ -141,7 +141,7 @@ def panorama_facts(panorama: Panorama) -> dict[str, Any]:
 
 
 def thumbnails(tracker: ShotTracker) -> dict[int, bytes]:
-    """Frame -> small gray JPEG of the shot's keyframes, at most THUMBNAILS of them, the first and the last among them."""
+    """Frame -> small gray JPEG of keyframes of the shot, at most THUMBNAILS of them, first and last included."""
     keys = sorted(tracker.keyframes)
     chosen = np.unique(np.linspace(0, len(keys) - 1, min(len(keys), THUMBNAILS)).round().astype(int))
     encoded = {}
