@@ -81,11 +81,14 @@ def _interpolate(nodes, step, at):  # type: ignore[no-untyped-def]
 
 def tolerance(rgb: Plane, options: MotionOptions) -> NDArray[np.float32]:
     """Difference (h, w), grey levels, that noise and a slight misregistration explain at each pixel."""
+    return np.float32(options.noise_grey) + np.float32(options.detail) * local_contrast(rgb)
+
+
+def local_contrast(rgb: Plane) -> NDArray[np.float32]:
+    """Range of each 3 x 3 neighbourhood (h, w), mean of the channels."""
     contrast = cv2.morphologyEx(rgb, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
-    mean = cv2.transform(
-        contrast, np.full((1, 3), 1 / 3)
-    )  # numpy's mean over three channels takes ten times as long
-    return np.float32(options.noise_grey) + np.float32(options.detail) * mean.astype(np.float32)
+    # numpy's mean over three channels takes ten times as long
+    return np.asarray(cv2.transform(contrast, np.full((1, 3), 1 / 3)), np.float32)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

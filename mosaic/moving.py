@@ -13,13 +13,14 @@ from __future__ import annotations
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.canvas import Canvas
+from mosaic.motion import expand_map, local_contrast
 from mosaic.surface import Placement, Surface
 from mosaic.tiles import Layers, Scene, paint
 from mosaic.views import Lattice
@@ -117,14 +118,14 @@ def _compare(
 ) -> _Compared:
     stored = scene.store.get(scene.views[index].frame, shrink)
     height, width = stored.rgb.shape[:2]
-    at = _positions(nodes, width, height)
-    truth = cv2.remap(layers.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    at = expand_map(nodes, STEP_PX, (width, height))
+    truth = np.asarray(cv2.remap(layers.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.uint8)
     facts = np.stack([layers.spread, layers.support, layers.n_seen], axis=-1)
     spread, support, n_seen = np.moveaxis(cv2.remap(facts, at[..., 0], at[..., 1], cv2.INTER_NEAREST), -1, 0)
-    frame = np.minimum(stored.rgb * scene.gains[index], 255).astype(np.uint8)
+    frame = _levelled(stored.rgb, scene.gains[index])
     apart = _apart(frame, truth)
     # Fine detail that lies a fraction of a pixel off differs without moving: allow for what a neighbour would explain.
-    detail = cv2.morphologyEx(truth, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).mean(axis=-1)
+    detail = local_contrast(truth)
     seen = n_seen > 1
     if stored.trust is not None:
         seen &= stored.trust > 0
@@ -153,9 +154,23 @@ def _compare(
     )
 
 
-def _apart(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float32]:
-    """Mean difference of the channels, green twice."""
-    return np.asarray(cv2.absdiff(a, b) @ np.array([0.25, 0.5, 0.25], np.float32))
+@numba.njit(cache=True, nogil=True)
+def _apart(a, b):  # type: ignore[no-untyped-def]
+    """Mean difference (h, w) float32 of the channels of two pictures, green twice."""
+    out = np.empty(a.shape[:2], np.float32)
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            red = abs(np.int32(a[i, j, 0]) - np.int32(b[i, j, 0]))
+            green = abs(np.int32(a[i, j, 1]) - np.int32(b[i, j, 1]))
+            blue = abs(np.int32(a[i, j, 2]) - np.int32(b[i, j, 2]))
+            out[i, j] = np.float32(0.25) * np.float32(red + 2 * green + blue)
+    return out
+
+
+def _levelled(rgb: NDArray[np.uint8], gain: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """rgb (h, w, 3) times gain (3,)."""
+    table = np.minimum(np.arange(256)[:, None] * gain, 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(rgb, np.ascontiguousarray(table[None])), np.uint8)
 
 
 def _surroundings(layers: Layers) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -187,7 +202,7 @@ def _where_composite_is_wrong(
         if not one.ghost.any():
             continue
         height, width = one.ghost.shape
-        at = np.rint(_positions(corners, width, height)[one.ghost]).astype(np.intp)
+        at = np.rint(expand_map(corners, STEP_PX, (width, height))[one.ghost]).astype(np.intp)
         at = at[((at >= 0) & (at < [shape[1], shape[0]])).all(axis=-1)]
         hit = np.zeros(shape, np.uint8)
         hit[at[:, 1], at[:, 0]] = 1
@@ -207,7 +222,7 @@ def _still_plane(
     side = 2 * max(2, round(width / 40)) + 1  # bridges a gap of a twentieth of the width
     core = one.moves.astype(np.uint8)
     if wrong.any():
-        at = _positions(nodes, width, height)
+        at = expand_map(nodes, STEP_PX, (width, height))
         ghost = cv2.remap(wrong, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0
         core |= (ghost & one.agrees).astype(np.uint8)
     body = cv2.dilate(cv2.morphologyEx(core, cv2.MORPH_CLOSE, _disc(side), borderValue=0), _disc(5))
@@ -226,12 +241,6 @@ def _still_plane(
     return np.asarray(plane, np.uint8)
 
 
-def _positions(nodes: NDArray[np.float64], width: int, height: int) -> NDArray[np.float32]:
-    """Surface pixels (h, w, 2) of all pixels of a small frame."""
-    across, down = _hat(width, nodes.shape[1]), _hat(height, nodes.shape[0])
-    return np.stack([down @ nodes[..., i] @ across.T for i in (0, 1)], axis=-1).astype(np.float32)
-
-
 def _disc(width: int, height: int | None = None) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, height or width)), dtype=np.uint8)
 
@@ -243,8 +252,3 @@ def _map_nodes(placement: Placement, surface: Surface, shrink: int) -> NDArray[n
     nodes = surface.ray_to_pixel(placement.pixel_to_ray(exact))
     # A node that no ray reaches goes far outside, and what is mixed with it too: there nothing is compared.
     return np.where(np.isfinite(nodes), nodes, -1e6)
-
-
-def _hat(n: int, n_nodes: int) -> NDArray[np.float64]:
-    """Weights (n, n_nodes) of linear interpolation between nodes STEP_PX apart."""
-    return np.maximum(1 - np.abs(np.arange(n)[:, None] / STEP_PX - np.arange(n_nodes)), 0.0)
