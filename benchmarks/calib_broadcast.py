@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import GateOptions, HomographyGraph, Priors, RefineOptions, Solution, judge, refine
+from calib import GateOptions, HomographyGraph, Priors, RefineOptions, Solution, fit_pupil, judge, refine
 from calib.camera import N_COLUMNS
 from calib.problem import Loss, PriorTerms, State, linearise, pack, residuals
 from calib.refine import free_columns
@@ -251,14 +251,19 @@ def realistic(seed: int) -> tuple[tracks.Truth, HomographyGraph]:
 
 
 def one_realistic(seed: int) -> dict[str, Any]:
-    """A realistic track with the default model, and with none for the distortion."""
+    """A realistic track: with the default model, with the pupil estimated, and with no distortion in the model."""
     truth, graph = realistic(seed)
     solution = refine(graph)
     verdict = judge(solution, graph)
+    pupil = fit_pupil(graph, solution)
+    corrected = judge(pupil.solution, pupil.graph)
     bare = refine(graph, options=RefineOptions(distortion=False))
     return {
-        "error": common_error(solution, truth), "total": verdict.sigma_log_f_total, "claims": verdict.claims_focal,
-        "reason": verdict.reason, "bare_claims": judge(bare, graph).claims_focal,
+        "default": {"error": common_error(solution, truth), "total": verdict.sigma_log_f_total,
+                    "claims": verdict.claims_focal, "reason": verdict.reason},
+        "pupil": {"error": common_error(pupil.solution, truth), "total": corrected.sigma_log_f_total,
+                  "claims": corrected.claims_focal, "reason": corrected.reason},
+        "accepted": pupil.accepted, "bare_claims": judge(bare, graph).claims_focal,
         "bare_error": common_error(bare, truth),
     }  # fmt: skip
 
@@ -367,24 +372,36 @@ def claim_lines(n: int, workers: int) -> list[str]:
 def realistic_lines(n: int, workers: int) -> list[str]:
     """Realistic tracks."""
     found = mapped(one_realistic, range(n), workers)
-    claimed = [f for f in found if f["claims"]]
-    errors = np.array([f["error"] for f in found])
-    spread = 1.4826 * float(np.median(np.abs(errors)))
-    total = np.array([f["total"] for f in found])
-    inside = np.mean([abs(f["error"]) <= 2 * f["total"] for f in claimed]) if claimed else float("nan")
-    return [
+    lines = [
         f"## {n} realistic tracks", "",
-        "k1_half .05 to .03 with the zoom, pupil .6 m before the pan axis over a pitch and a stand, half of the lower "
-        "cells empty, LED boards that drag, 2 % wrong edges.", "",
-        "| | asked | found |", "|---|---|---|",
-        f"| median focal error | <= 3 % | {100 * np.median(np.abs(errors)):.2f} % |",
-        f"| claims inside two stated sigma | >= 93 % | {100 * inside:.1f} % of {len(claimed)} |",
-        f"| stated sigma (median) over true spread ({100 * spread:.2f} %) | <= 3 "
-        f"| {np.nanmedian(total) / spread:.2f} |",
-        f"| refused | | {n - len(claimed)} ({_reasons(found)}) |",
-        f"| claimed without distortion in the model (error {percent([f['bare_error'] for f in found]):.0f} %) | 0 "
-        f"| {sum(f['bare_claims'] for f in found)} |", "",
+        "k1_half .05 to .03 with the zoom, pupil .6 m before the pan axis over a pitch (15 m below) and a stand (95 m "
+        "away), half of the lower cells empty, LED boards that drag, 2 % wrong edges. With `fit_pupil`: its parallax "
+        f"estimated, and believed in {sum(f['accepted'] for f in found)} tracks; the scene is what its model takes it for.",
+        "",
+        "| | asked | default model | with `fit_pupil` |", "|---|---|---|---|",
     ]  # fmt: skip
+    cells: dict[str, list[str]] = {}
+    for model in ("default", "pupil"):
+        each = [f[model] for f in found]
+        claimed = [f for f in each if f["claims"]]
+        errors, total = np.array([f["error"] for f in each]), np.array([f["total"] for f in each])
+        spread = float(np.sqrt(np.nanmean(errors**2)))
+        inside = np.mean([abs(f["error"]) <= 2 * f["total"] for f in claimed]) if claimed else float("nan")
+        cells[model] = [
+            f"{_median(each, 'error')} %", f"{100 * np.nanmean(errors):.2f} %",
+            f"{100 * inside:.1f} % of {len(claimed)}",
+            f"{np.nanmedian(total) / spread:.2f} ({_median(each, 'total')} over {100 * spread:.2f} %)",
+            f"{n - len(claimed)} ({_reasons(each)})",
+        ]  # fmt: skip
+    names = ("median focal error", "mean error", "claims inside two stated sigma", "stated sigma over true rms error",
+             "refused")  # fmt: skip
+    asked = ("<= 3 %", "", ">= 93 %", "<= 3", "")
+    lines += [f"| {name} | {a} | {cells['default'][k]} | {cells['pupil'][k]} |"
+              for k, (name, a) in enumerate(zip(names, asked, strict=True))]  # fmt: skip
+    bare = percent([f["bare_error"] for f in found])
+    lines += [f"| claimed without distortion in the model (error {bare:.0f} %) | 0 "
+              f"| {sum(f['bare_claims'] for f in found)} | |", ""]  # fmt: skip
+    return lines
 
 
 def main() -> None:

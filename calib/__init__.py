@@ -11,6 +11,7 @@ from calib.homography_fit import fit_homography
 from calib.level import LevelOptions, level
 from calib.observability import observability
 from calib.poses import PoseOptions, solve_poses
+from calib.pupil import PupilFit, PupilOptions, fit_pupil
 from calib.records import (
     HomographyEdge,
     HomographyGraph,
@@ -38,6 +39,8 @@ __all__ = [
     "LevelOptions",
     "PoseOptions",
     "Priors",
+    "PupilFit",
+    "PupilOptions",
     "RefineOptions",
     "RunningCalibrator",
     "RunningOptions",
@@ -45,6 +48,7 @@ __all__ = [
     "Verdict",
     "calibrate",
     "fit_homography",
+    "fit_pupil",
     "judge",
     "level",
     "observability",
