@@ -376,8 +376,8 @@ def realistic_lines(n: int, workers: int) -> list[str]:
         f"## {n} realistic tracks", "",
         "k1_half .05 to .03 with the zoom, pupil .6 m before the pan axis over a pitch (15 m below) and a stand (95 m "
         "away), half of the lower cells empty, LED boards that drag, 2 % wrong edges. With `fit_pupil`: its parallax "
-        f"estimated, and believed in {sum(f['accepted'] for f in found)} tracks; the scene is what its model takes it for.",
-        "",
+        f"estimated, and believed in {sum(f['accepted'] for f in found)} tracks; the scene is what its model takes it "
+        "for.", "",
         "| | asked | default model | with `fit_pupil` |", "|---|---|---|---|",
     ]  # fmt: skip
     cells: dict[str, list[str]] = {}
