@@ -407,13 +407,16 @@ def polish(
     n_steps, tried = 0, np.zeros(packed.n_edges, bool)
     # Thousands of frames: a quarter of the points brings them as near as the last steps on all points need.
     large = packed.n_edges * packed.dof.shape[1] > THIN_ABOVE
-    layout, of = Layout(packed.select(ok), row, free), ok
+
+    def chosen_by(ok: NDArray[np.bool_]) -> tuple[Packed, Layout, NDArray[np.bool_]]:
+        some = packed.select(ok)
+        return some.thin(options.thin) if large else some, Layout(some, row, free), ok
+
+    chosen, layout, of = chosen_by(ok)
     for look in range(MAX_LOOKS):
         loss = Loss("huber", scale, options.huber)
-        chosen = packed.select(ok)
-        chosen = chosen.thin(options.thin) if large else chosen
         if (of != ok).any():
-            layout, of = Layout(chosen, row, free), ok
+            chosen, layout, of = chosen_by(ok)
         rough = minimise(
             chosen, layout, terms, state, loss, max_steps=options.max_steps, tolerance=1e-6,
             damping0=1e-4 if look == 0 else WARM_DAMPING,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -48,7 +49,7 @@ class Layout:
         self.columns = np.concatenate([a, b, shared], 1)  # (E, 13)
         self.dense = 4 * n < DENSE_BELOW
         self._gather: sp.csr_array | None = None
-        self._pattern: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None = None
+        self._pattern: tuple[Any, ...] | None = None
 
     def vector(self, per_edge: Array) -> Array:
         """Sum of per-edge vectors (S, E, 13) into (S, 4 n + 5)."""
@@ -66,16 +67,47 @@ class Layout:
         out = self._gather @ blocks.reshape(len(blocks), -1).T
         return np.ascontiguousarray(out.T).reshape(-1, self.size, self.size)
 
-    def sparse(self, blocks: Array) -> sp.csc_array:
-        """Sum of one start's blocks (E, 13, 13) as a sparse matrix (4 n + 5, 4 n + 5); the pattern is made once."""
+    def sparse(self, blocks: Array) -> tuple[sp.csc_array, Array, Array]:
+        """Sums of one start's blocks (E, 13, 13): active poses (p, p) sparse, poses by shared (4 n, 5), shared (5, 5).
+
+        Frame blocks are summed per frame and per pair of frames; where they go in the matrix is worked out once.
+        """
         if self._pattern is None:
-            row, col = self.columns[:, :, None], self.columns[:, None, :]
-            keys, slot = np.unique((col * self.size + row).ravel(), return_inverse=True)
-            pointers = np.searchsorted(keys // self.size, np.arange(self.size + 1))
-            self._pattern = keys % self.size, pointers, slot
-        indices, pointers, slot = self._pattern
-        data = np.bincount(slot, blocks.ravel(), len(indices))
-        return sp.csc_array((data, indices, pointers), shape=(self.size, self.size))
+            self._pattern = self._make_pattern()
+        ia, ib, swap, slot, n_pairs, place, indices, pointers = self._pattern
+        n = self.n
+        diagonal, pair, border = np.empty((n, 4, 4)), np.empty((n_pairs, 4, 4)), np.empty((n, 4, N_SHARED))
+        coupling = np.where(swap[:, None, None], blocks[:, 4:8, 0:4], blocks[:, 0:4, 4:8])
+        for i in range(4):
+            for j in range(4):
+                diagonal[:, i, j] = np.bincount(ia, blocks[:, i, j], n)
+                diagonal[:, i, j] += np.bincount(ib, blocks[:, 4 + i, 4 + j], n)
+                pair[:, i, j] = np.bincount(slot, coupling[:, i, j], n_pairs)
+            for j in range(N_SHARED):
+                border[:, i, j] = np.bincount(ia, blocks[:, i, 8 + j], n)
+                border[:, i, j] += np.bincount(ib, blocks[:, 4 + i, 8 + j], n)
+        values = np.concatenate([diagonal.ravel(), pair.ravel(), np.swapaxes(pair, 1, 2).ravel()])
+        A = sp.csc_array((values[place], indices, pointers), shape=(len(pointers) - 1,) * 2)
+        return A, border.reshape(4 * n, N_SHARED), blocks[:, 8:, 8:].sum(0)
+
+    def _make_pattern(self) -> tuple[Any, ...]:
+        n = self.n
+        ia, ib = self.columns[:, 0] // 4, self.columns[:, 4] // 4
+        swap = ia > ib
+        low, high = np.minimum(ia, ib), np.maximum(ia, ib)
+        keys, slot = np.unique(low * n + high, return_inverse=True)
+        rows = np.concatenate([np.arange(n), keys // n, keys % n])
+        cols = np.concatenate([np.arange(n), keys % n, keys // n])
+        order = np.lexsort((cols, rows))
+        # A matrix of running numbers instead of values: after all conversions its data say where each value goes.
+        numbers = np.arange(1, 16 * len(rows) + 1, dtype=float).reshape(-1, 4, 4)[order]
+        starts = np.searchsorted(rows[order], np.arange(n + 1))
+        poses = np.flatnonzero(self.active[: 4 * n])
+        whole = sp.bsr_array((numbers, cols[order], starts), shape=(4 * n, 4 * n)).tocsc()
+        part = whole[:, poses].tocsr()[poses].tocsc()
+        part.sort_indices()
+        place = np.rint(part.data).astype(np.int64) - 1
+        return ia, ib, swap, slot, len(keys), place, part.indices, part.indptr
 
 
 class NormalEquations:
@@ -114,21 +146,21 @@ class NormalEquations:
     def _sparse(self, lin: Linearised) -> None:
         layout = self.layout
         n, N = layout.n, layout.size
-        full = layout.sparse(lin.blocks[0]) + sp.diags_array(self.extra)
         keep = np.flatnonzero(layout.active)
         self.poses, self.lens = keep[keep < 4 * n], keep[keep >= 4 * n]
-        full = full.tocsc()
-        self.full = full
-        self.A = full[self.poses][:, self.poses].tocsc()
+        A, border, shared = layout.sparse(lin.blocks[0])
+        self.A = (A + sp.diags_array(self.extra[self.poses])).tocsc()
+        shared = shared + np.diag(self.extra[4 * n :])
         u = (self.poses % 4 == 0).astype(float)[:, None]
         # The mean-log-f prior is rank one: as a bordered variable it keeps A sparse.
-        self.B = np.hstack([full[self.poses][:, self.lens].toarray(), u])
+        self.B = np.hstack([border[self.poses][:, self.lens - 4 * n], u])
         k = len(self.lens)
         self.D = np.zeros((k + 1, k + 1))
-        self.D[:k, :k] = full[self.lens][:, self.lens].toarray()
+        self.D[:k, :k] = shared[np.ix_(self.lens - 4 * n, self.lens - 4 * n)]
         self.D[k, k] = -1 / self.mean_weight
         self.diagonal = np.ones((1, N))
-        self.diagonal[0, keep] = full.diagonal()[keep]
+        self.diagonal[0, self.poses] = self.A.diagonal()
+        self.diagonal[0, self.lens] = np.diagonal(self.D)[:k]
 
     def solve(self, start: int, damping: float) -> Array:
         """Damped step (4 n + 5,) of one start. Raises numpy.linalg.LinAlgError when the matrix is singular."""
@@ -175,7 +207,18 @@ class NormalEquations:
         if self.dense is not None:
             return DenseCovariance(self.covariance(), layout.n)
         ia, ib = layout.columns[:, 0] // 4, layout.columns[:, 4] // 4
-        return SelectedCovariance(self.full, layout.active, layout.n, ia, ib, self.mean_weight)
+        # All unknowns again: held ones as empty rows.
+        n = layout.n
+        spread = sp.csc_array(
+            (np.ones(len(self.poses)), (self.poses, np.arange(len(self.poses)))),
+            shape=(4 * n, len(self.poses)),
+        )
+        k = len(self.lens)
+        border, shared = np.zeros((4 * n, N_SHARED)), np.eye(N_SHARED)
+        border[np.ix_(self.poses, self.lens - 4 * n)] = self.B[:, :k]
+        shared[np.ix_(self.lens - 4 * n, self.lens - 4 * n)] = self.D[:k, :k]
+        full = sp.block_array([[spread @ self.A @ spread.T, border], [border.T, shared]]).tocsc()
+        return SelectedCovariance(full, layout.active, layout.n, ia, ib, self.mean_weight)
 
     def covariance(self, start: int = 0) -> Array:
         """Inverse of the undamped matrix, (4 n + 5, 4 n + 5), zero rows for held unknowns: for small n, and tests.
