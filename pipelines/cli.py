@@ -11,19 +11,14 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pipelines.cli_logging import set_up_logging
 from pipelines.cli_results import complete_names, format_names, print_json, register
-from pipelines.errors import (
-    EXIT_INTERRUPTED,
-    EXIT_OK,
-    EXIT_SHOTS_FAILED,
-    EXIT_USAGE,
-    InputError,
-    UserError,
-)
+from pipelines.cli_runs import RunResult, exit_code
+from pipelines.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, InputError, UserError
 
 if TYPE_CHECKING:
     from pipelines.config import Config
@@ -43,7 +38,18 @@ app = typer.Typer(
 _UsageProblem: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 Clips = Annotated[
-    list[Path], typer.Argument(help="Video file, folder of images, or pattern like frames/%06d.png.")
+    list[Path] | None,
+    typer.Argument(
+        help="Video file, folder of images, pattern like frames/%06d.png or 'frames/*.png', or - for standard input.",
+        show_default=False,
+    ),
+]
+ClipList = Annotated[
+    Path | None,
+    typer.Option("--list", help="Text file with one clip a line; a folder for each, as for several."),
+]
+Jobs = Annotated[
+    int, typer.Option(min=1, max=256, help="Clips at work at the same time, each in a process of its own.")
 ]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the results; made if it is not there.")]
 ConfigFile = Annotated[
@@ -167,8 +173,10 @@ def _common(
 @app.command(epilog="Every setting is an option too: --shots.min_frames 5; run --help-config lists them.")
 def run(
     context: typer.Context,
-    clips: Clips,
     out: Out,
+    clips: Clips = None,
+    clip_list: ClipList = None,
+    jobs: Jobs = 1,
     config: ConfigFile = None,
     export: Annotated[
         str,
@@ -185,16 +193,14 @@ def run(
 ) -> int:
     """Camera track, homographies, panorama and report of one clip, or of many (a folder each)."""
     settings = _settings(context, config, export)
-    _set_up_logging(quiet, verbose)
-    if len(clips) == 1:
-        result = _run_one(clips[0], out, settings, resume, quiet)
-        results = [result]
-    else:
-        results = [
-            _run_guarded(clip, out / name, settings, resume, quiet)
-            for clip, name in zip(clips, folder_names(clips), strict=True)
-        ]
-    return _report(results, as_json, quiet)
+    set_up_logging(quiet, verbose)
+    if clip_list is not None or len(clips or ()) > 1:
+        from pipelines.cli_many import run_clips
+
+        return run_clips(clips or (), clip_list, out, settings, jobs, resume, as_json, quiet, verbose)
+    if not clips:
+        raise typer.BadParameter("no clip was given: name one, or a file of names with --list")
+    return _report(_run_one(clips[0], out, settings, resume, quiet), as_json, quiet)
 
 
 @app.command()
@@ -208,23 +214,21 @@ def demo(
 ) -> int:
     """The sample clip through `run`, then its truth beside the estimate."""
     settings = _settings(context, None)
-    _set_up_logging(quiet, verbose)
+    set_up_logging(quiet, verbose)
     clip, truth = sample_clip()
     result = _run_one(clip, out, settings, resume, quiet)
     from pipelines.compare import compare_run, comparison_table
 
     comparison = compare_run(out, truth)
-    code = _report([result], False, quiet or as_json)
+    code = _report(result, False, quiet or as_json)
     if as_json:
-        print_json({"exit_code": code, "clips": [_as_document(result)], "comparison": comparison})
+        print_json({"exit_code": code, "clips": [result.as_dict()], "comparison": comparison})
     elif not quiet:
         print(f"\ntruth ({truth}) against estimate:\n{comparison_table(comparison)}")
     return code
 
 
-def _run_one(
-    clip: Path, out: Path, config: Config, resume: bool, quiet: bool, title: str = ""
-) -> dict[str, Any]:
+def _run_one(clip: Path, out: Path, config: Config, resume: bool, quiet: bool) -> RunResult:
     from pipelines.progress import TerminalProgress
 
     if not clip.exists() and "%" not in clip.name:
@@ -232,39 +236,9 @@ def _run_one(
         raise InputError(clip, "no such file", "check the path")
     from pipelines.run import process
 
-    with TerminalProgress(title, show=not quiet) as progress:
+    with TerminalProgress(show=not quiet) as progress:
         record = process(clip, out, config, progress=progress, resume=resume or config.run.resume)
-    return {"clip": clip, "out": out, "record": record, "error": None}
-
-
-def _run_guarded(clip: Path, out: Path, config: Config, resume: bool, quiet: bool) -> dict[str, Any]:
-    """One clip of many: whatever happens to it is its own result, and the others go on."""
-    failed = {"clip": clip, "out": out, "record": None}
-    try:
-        return _run_one(clip, out, config, resume, quiet, f"{clip.name}: ")
-    except UserError as error:
-        print(f"broadcast-mosaic: {error}", file=sys.stderr)
-        return {**failed, "error": error.as_dict()}
-    except Exception as error:
-        log.exception("%s: a bug in broadcast-mosaic; the other clips go on", clip)
-        cause = f"{type(error).__name__}: {error}"
-        return {
-            **failed,
-            "error": {"kind": "bug", "what": str(clip), "cause": cause, "cure": "please report it"},
-        }
-
-
-def folder_names(clips: Sequence[Path]) -> list[str]:
-    """A folder name for each clip: its stem, numbered where that is taken. The same clips give the same names."""
-    names: list[str] = []
-    for clip in clips:
-        pattern = "%" in clip.name and not clip.exists()
-        stem = (clip.absolute().parent.name if pattern else clip.stem) or "clip"
-        name, number = stem, 2
-        while name in names:
-            name, number = f"{stem}-{number}", number + 1
-        names.append(name)
-    return names
+    return RunResult(clip=clip, out=out, record=record)
 
 
 def sample_clip() -> tuple[Path, Path]:
@@ -277,52 +251,18 @@ def sample_clip() -> tuple[Path, Path]:
     raise InputError("sample.mp4", "the sample clip is not installed", "install broadcast-mosaic again")
 
 
-def exit_code(results: Sequence[Mapping[str, Any]]) -> int:
-    """2 when a clip could not be used, 1 when a shot failed, none was found, or a bug struck; else 0."""
-    errors = [result["error"]["kind"] for result in results if result["error"] is not None]
-    if any(kind != "bug" for kind in errors):
-        return EXIT_USAGE
-    records = [result["record"] for result in results if result["record"] is not None]
-    failed = any(
-        not record.shots or any(shot.status == "failed" for shot in record.shots) for record in records
-    )
-    return EXIT_SHOTS_FAILED if errors or failed else EXIT_OK
-
-
-def _report(results: Sequence[Mapping[str, Any]], as_json: bool, quiet: bool) -> int:
-    code = exit_code(results)
+def _report(result: RunResult, as_json: bool, quiet: bool) -> int:
+    code = exit_code([result])
     if as_json:
-        print_json({"exit_code": code, "clips": [_as_document(result) for result in results]})
+        print_json({"exit_code": code, "clips": [result.as_dict()]})
         return code
-    for result in results:
-        record = result["record"]
-        if record is None:
-            continue
-        if not quiet:
-            from pipelines.summary import print_summary
+    if not quiet and result.record is not None:
+        from pipelines.summary import print_summary
 
-            print_summary(result["out"], record)
-        for shot in record.shots:
-            if shot.status == "failed":
-                reason = shot.sentence or shot.reason
-                print(
-                    f"broadcast-mosaic: {result['clip']}: shot {shot.index} failed: {reason}", file=sys.stderr
-                )
-        if not record.shots:
-            print(f"broadcast-mosaic: {result['clip']}: no shot was found", file=sys.stderr)
+        print_summary(result.out, result.record)
+    for line in result.failures():
+        print(f"broadcast-mosaic: {line}", file=sys.stderr)
     return code
-
-
-def _as_document(result: Mapping[str, Any]) -> dict[str, Any]:
-    from pipelines.archive import run_as_dict
-
-    record = result["record"]
-    return {
-        "clip": str(result["clip"]),
-        "out": str(result["out"]),
-        "error": result["error"],
-        "run": run_as_dict(record) if record is not None else None,
-    }
 
 
 # ---- probe and compare
@@ -346,7 +286,7 @@ def _probe(
 ) -> int:
     """What a file is: size, rate, scan, colour, time code; shots and overlays by a quick look."""
     settings = _settings(context, None)
-    _set_up_logging(quiet, False)
+    set_up_logging(quiet, False)
     from pipelines.probe import probe, probe_text
     from pipelines.progress import TerminalProgress
 
@@ -380,29 +320,6 @@ def _compare(
 
 
 register(app)
-
-# ---- output
-
-
-class _CurrentStderr(logging.StreamHandler[Any]):
-    """Writes to whatever stderr is now: progress bars put themselves in its place while they show."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        # Not setStream: that flushes the old stream, which may be closed by now. Every emit has flushed already.
-        self.stream = sys.stderr
-        super().emit(record)
-
-
-def _set_up_logging(quiet: bool, verbose: bool) -> None:
-    level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
-    handler = _CurrentStderr()
-    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
-    root = logging.getLogger()
-    for old in [h for h in root.handlers if isinstance(h, _CurrentStderr)]:
-        root.removeHandler(old)
-    root.addHandler(handler)
-    for package in ("mosaic", "calib", "pipelines"):
-        logging.getLogger(package).setLevel(level)
 
 
 if __name__ == "__main__":

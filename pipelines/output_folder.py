@@ -11,6 +11,8 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import IO, Any, Self
@@ -161,6 +163,27 @@ class OutputFolder:
             (self.out / LOCK).unlink(missing_ok=True)
             self._lock.close()
             self._lock = None
+
+
+@contextmanager
+def held_folder(out: Path) -> Iterator[None]:
+    """OUT, made if need be, with its lock held and nothing else done to it: for the folder above those of many clips.
+
+    Raises OutputError: it cannot be made or written, or another run uses it.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = _take_lock(out)
+    except (FileExistsError, NotADirectoryError):
+        raise OutputError(out, "is a file, not a folder", "choose another folder with -o") from None
+    except OSError as error:
+        cause = f"cannot be written ({error.strerror})"
+        raise OutputError(out, cause, "choose another folder with -o") from None
+    try:
+        yield
+    finally:
+        (out / LOCK).unlink(missing_ok=True)
+        lock.close()
 
 
 def save_shot(staging: Path, record: ShotRecord, rows: CameraTable) -> None:

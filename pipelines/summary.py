@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -46,6 +48,29 @@ def print_summary(out: Path, record: RunRecord) -> None:
     if exports:
         console.print(escape(f"exports: {', '.join(export_words(out, record, name) for name in exports)}"))
     console.print(escape(f"results: {out / 'report.html'}, {out / 'camera.csv'}, {out / 'run.json'}"))
+
+
+def print_clips(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """A line a clip, of the rows of summary.csv, on stdout; `path` is that file."""
+    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else WIDTH, highlight=False)
+    table = Table("folder", "status", "frames", "shots", "focal length px", "s", "reason")
+    for row in rows:
+        ends = [
+            f"{row[f'f_{end}_px']:.0f} ± {row[f'f_{end}_std_px']:.0f}"
+            for end in ("min", "max")
+            if row[f"f_{end}_px"] is not None
+        ]
+        counts = ("" if row[name] is None else str(row[name]) for name in ("frames", "shots"))
+        cells = (
+            row["folder"],
+            row["status"],
+            *counts,
+            " to ".join(ends) or "not known",
+            f"{row['seconds']:.0f}",
+        )
+        table.add_row(*(escape(cell) for cell in (*cells, row["reason"])))
+    console.print(table)
+    console.print(escape(f"results: a folder for each clip in {path.parent}, all of them in {path}"))
 
 
 def export_words(out: Path, record: RunRecord, name: str) -> str:

@@ -197,43 +197,6 @@ def test_a_bug_keeps_its_traceback(
         cli.main(["run", clip("bug.mp4"), "-o", str(tmp_path / "out")])
 
 
-def test_one_failing_clip_never_stops_the_others(
-    tmp_path: Path,
-    calls: list[dict[str, Any]],
-    clip: Callable[[str], str],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    clips = [clip(name) for name in ("bad.mp4", "a.mp4", "b/a.mov", "weak.mp4")]
-    out = tmp_path / "out"
-    assert cli.main(["run", *clips, "-o", str(out), "--json"]) == 2
-    shown = capsys.readouterr()
-    document = json.loads(shown.out)
-    assert [Path(c["out"]).name for c in document["clips"]] == ["bad", "a", "a-2", "weak"]
-    assert [c["error"] is None for c in document["clips"]] == [False, True, True, True]
-    assert (out / "a" / "run.json").is_file() and (out / "a-2" / "run.json").is_file()
-    assert "bad.mp4" in one_line(shown.err)
-    assert cli.main(["run", *clips[1:], "-o", str(out), "-q"]) == 1
-
-
-def test_a_bug_in_one_of_many_clips_is_logged_and_the_others_go_on(
-    tmp_path: Path,
-    calls: list[dict[str, Any]],
-    clip: Callable[[str], str],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    args = ["run", clip("bug.mp4"), clip("a.mp4"), "-o", str(tmp_path / "out"), "--json"]
-    assert cli.main(args) == 1
-    shown = capsys.readouterr()
-    assert "Traceback" in shown.err and "RuntimeError: index out of range" in shown.err
-    assert json.loads(shown.out)["clips"][0]["error"]["kind"] == "bug"
-
-
-def test_image_patterns_take_the_name_of_their_folder(tmp_path: Path) -> None:
-    assert cli.folder_names([tmp_path / "take1" / "%06d.png", tmp_path / "take1", Path("x.y.mp4")]) == [
-        "take1", "take1-2", "x.y"
-    ]  # fmt: skip
-
-
 def test_demo_puts_truth_beside_estimate(
     tmp_path: Path,
     calls: list[dict[str, Any]],
