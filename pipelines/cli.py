@@ -10,6 +10,7 @@ import logging
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +20,7 @@ from pipelines.cli_logging import set_up_logging
 from pipelines.cli_results import complete_names, format_names, print_json, register
 from pipelines.cli_runs import RunResult, exit_code
 from pipelines.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, InputError, UserError
+from pipelines.stills import is_pattern
 
 if TYPE_CHECKING:
     from pipelines.config import Config
@@ -231,13 +233,18 @@ def demo(
 def _run_one(clip: Path, out: Path, config: Config, resume: bool, quiet: bool) -> RunResult:
     from pipelines.progress import TerminalProgress
 
-    if not clip.exists() and "%" not in clip.name:
+    given: AbstractContextManager[Path] = nullcontext(clip)
+    if clip == Path("-"):
+        from pipelines.stdin import spooled
+
+        given = spooled(sys.stdin.buffer, out, int(config.decode.stdin_max_gb * 1e9))
+    elif not clip.exists() and not is_pattern(clip):
         # Before the seconds that the heavy imports take.
         raise InputError(clip, "no such file", "check the path")
     from pipelines.run import process
 
-    with TerminalProgress(show=not quiet) as progress:
-        record = process(clip, out, config, progress=progress, resume=resume or config.run.resume)
+    with TerminalProgress(show=not quiet) as progress, given as path:
+        record = process(path, out, config, progress=progress, resume=resume or config.run.resume)
     return RunResult(clip=clip, out=out, record=record)
 
 
@@ -290,8 +297,18 @@ def _probe(
     from pipelines.probe import probe, probe_text
     from pipelines.progress import TerminalProgress
 
-    with TerminalProgress(show=not quiet) as progress:
-        facts = probe(clip, settings, shots=shots, seconds=seconds or None, progress=progress)
+    given: AbstractContextManager[Path] = nullcontext(clip)
+    if clip == Path("-"):
+        import tempfile
+
+        from pipelines.stdin import spooled
+
+        # Where the results of a run would be stored there is no folder for probe.
+        given = spooled(
+            sys.stdin.buffer, Path(tempfile.gettempdir()), int(settings.decode.stdin_max_gb * 1e9)
+        )
+    with TerminalProgress(show=not quiet) as progress, given as path:
+        facts = probe(path, settings, shots=shots, seconds=seconds or None, progress=progress)
     if as_json:
         print_json({"exit_code": EXIT_OK, **facts})
     else:

@@ -12,10 +12,11 @@ from pipelines.cli_results import print_json
 from pipelines.cli_runs import RunResult, exit_code
 from pipelines.clip_summary import row, write_summary
 from pipelines.config import Config
-from pipelines.errors import OutputError, UserError
+from pipelines.errors import InputError, OutputError, UserError
 from pipelines.many import SUMMARY, Outcome, Task, folder_names, read_list, run_many, work_on
 from pipelines.output_folder import held_folder
 from pipelines.progress import TerminalProgress
+from pipelines.stdin import STDIN
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,8 @@ def run_clips(
     not be written at the end. What goes wrong with a clip is in its row.
     """
     clips = [*named, *(read_list(listed) if listed is not None else ())]
+    if STDIN in clips:
+        raise InputError(STDIN, "standard input can only be the one clip of a run", "name files")
     tasks = [
         Task(
             clip=clip, out=out / name, config=config, resume=resume or config.run.resume, quiet=quiet, verbose=verbose

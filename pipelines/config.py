@@ -69,6 +69,15 @@ class DecodeOptions(Section):
             "px; a larger declared width or height is refused before memory is asked for: no camera makes one"
         ),
     )
+    stdin_max_gb: float = Field(
+        default=64.0,
+        gt=0,
+        le=10000,
+        description=(
+            "GB taken from standard input, which is stored beside the results while the run lasts; "
+            "64 are two hours at 70 Mbit/s"
+        ),
+    )
     accept_zero_timecode: bool = Field(
         default=False,
         description=(

@@ -14,6 +14,7 @@ import weakref
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,14 @@ from numpy.typing import NDArray
 from pipelines.config import DecodeOptions
 from pipelines.errors import InputError
 from pipelines.picture import Picture
-from pipelines.sources import Source, list_images, open_source
+from pipelines.scan import LOOK, STEP, judge_scan
+from pipelines.sources import Source, open_source
+from pipelines.stdin import shown_path
+from pipelines.stills import IMAGE_SUFFIXES, list_images
 from pipelines.timing import PtsRepair, Timecode
 
 UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
+HDR = {16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}  # by FFmpeg's AVCOL_TRC
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,7 +65,9 @@ class ClipFacts:
     size_px: (w, h) of the pictures handed out, after rotation. fps: decoded frames/s by the header, NaN unknown;
     picture_fps: pictures handed out per s (twice fps where fields are). n_frames_header: as the header claims, or None.
     colour: space, range, primaries, transfer as FFmpeg's numbers and the matrix used for RGB. rotation_deg: applied,
-    counter-clockwise. deinterlace: 'none', 'bwdif send_field' or 'bwdif send_frame'. timecode: of picture 0, or ''.
+    counter-clockwise. scan_seen: 'tff', 'bff', 'progressive', 'unknown' by the first pictures' content; scan_flagged:
+    'interlaced' or 'progressive' by its first picture's flag; field_order: that of the content if interlaced, '' = as
+    flagged. deinterlace: 'none', 'bwdif send_field' or 'bwdif send_frame'. timecode: of picture 0, or ''.
     """
 
     path: Path
@@ -75,6 +82,9 @@ class ClipFacts:
     bit_depth: int
     colour: dict[str, Any]
     interlaced: bool
+    field_order: str
+    scan_seen: str
+    scan_flagged: str
     deinterlace: str
     pixel_aspect: float
     rotation_deg: int
@@ -112,7 +122,7 @@ class ClipFacts:
         for name in self.__slots__:
             value = getattr(self, name)
             if isinstance(value, Path):
-                value = str(value)
+                value = shown_path(value)
             elif isinstance(value, float) and not np.isfinite(value):
                 value = None
             elif isinstance(value, tuple | list):
@@ -186,16 +196,20 @@ def open_clip(path: str | Path, options: DecodeOptions | None = None) -> Clip:
             raise InputError(
                 path, "no picture could be decoded", "it is damaged, or its codec is not in this FFmpeg"
             )
-        return Clip(_facts(source, first, options), options)
+        look = (first, *islice(source.pictures(), LOOK - 1)) if options.deinterlace != "off" else (first,)
+        seen = judge_scan(_gray(picture.video, 0)[:, ::STEP].astype(np.float32) for picture in look)
+        return Clip(_facts(source, first, options, seen), options)
 
 
-def _facts(source: Source, first: Picture, options: DecodeOptions) -> ClipFacts:
+def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) -> ClipFacts:
     video = first.video
     turns = _quarter_turns(video)
     warnings = list(source.warnings)
     width, height = (video.width, video.height) if turns % 2 == 0 else (video.height, video.width)
     # The picture's own flag decides: stream headers call plenty of progressive material interlaced.
-    interlaced = bool(video.interlaced_frame)
+    flagged = bool(video.interlaced_frame)
+    field_order = _judge_order(flagged, source.field_order, seen, warnings)
+    interlaced = flagged or bool(field_order)
     if source.says_interlaced and not interlaced:
         warnings.append(
             "the stream calls itself interlaced, its first picture is not: each is judged by itself"
@@ -208,6 +222,8 @@ def _facts(source: Source, first: Picture, options: DecodeOptions) -> ClipFacts:
     if turns:
         warnings.append(f"rotated by {90 * turns} degrees counter-clockwise, as the file asks")
         aspect = aspect if turns % 2 == 0 or options.pixel_aspect else 1.0 / aspect
+    if (hdr := HDR.get(int(getattr(video, "color_trc", UNSPECIFIED)))) is not None:
+        warnings.append(f"{hdr}: grey and colours are the coded values, not tone-mapped: panoramas look flat")
     stat = source.path.stat() if source.path.exists() else None
     timecode = source.timecode or _gop_timecode(video, source.fps)
     if timecode is not None and timecode.count == 0 and not options.accept_zero_timecode:
@@ -228,9 +244,13 @@ def _facts(source: Source, first: Picture, options: DecodeOptions) -> ClipFacts:
             "range": int(video.color_range),
             "primaries": int(getattr(video, "color_primaries", UNSPECIFIED)),
             "transfer": int(getattr(video, "color_trc", UNSPECIFIED)),
+            "transfer_name": HDR.get(int(getattr(video, "color_trc", UNSPECIFIED)), ""),
             "rgb_matrix": "none" if video.format.is_rgb else Colorspace(_matrix(video)).name,
         },
         interlaced=interlaced,
+        field_order=field_order,
+        scan_seen=seen,
+        scan_flagged="interlaced" if flagged else "progressive",
         deinterlace=mode,
         pixel_aspect=float(aspect),
         rotation_deg=90 * turns,
@@ -239,6 +259,25 @@ def _facts(source: Source, first: Picture, options: DecodeOptions) -> ClipFacts:
         mtime_ns=stat.st_mtime_ns if stat is not None else 0,
         warnings=warnings,
     )
+
+
+def _judge_order(flagged: bool, stated: str, seen: str, warnings: list[str]) -> str:
+    """The field order for deinterlacing: what the pictures show; '' = as flagged. Says where the two differ."""
+    if seen in ("tff", "bff"):
+        first = {"tff": "top", "bff": "bottom"}[seen]
+        if not flagged:
+            warnings.append(
+                f"flagged progressive, but its pictures are interlaced, {first} field first: so taken"
+            )
+        elif stated and stated != seen:
+            warnings.append(f"flagged {stated}, but its pictures have the {first} field first: so taken")
+        return seen
+    if seen == "progressive" and flagged:
+        # Not left alone for this: what follows a progressive title may be interlaced.
+        warnings.append(
+            "flagged interlaced, but its first pictures are progressive: each comes twice unless decode.deinterlace off"
+        )
+    return ""
 
 
 # ---- pixels
@@ -418,7 +457,10 @@ def _frames(
     complete = True
     with open_source(facts.path, options) as source:
         repair = PtsRepair(facts.fps)
-        pictures = source.fields(repair.apply(source.pictures()), options.deinterlace)
+        everything = facts.interlaced and facts.scan_flagged == "progressive"  # by the content alone
+        pictures = source.fields(
+            repair.apply(source.pictures()), options.deinterlace, facts.field_order, everything
+        )
         for index, picture in enumerate(pictures):
             if last is not None and index > last:
                 complete = False
@@ -444,14 +486,15 @@ def _frames(
         counts["repaired_pts"] = repair.n_repaired
         counts["gaps"] = repair.n_gaps
         if complete and counts["decoded"] < 2:
-            raise InputError(
-                facts.path, "only one picture could be decoded", "a clip needs at least two frames"
-            )
+            cure = "a clip needs at least two frames"
+            if facts.path.suffix.lower() in IMAGE_SUFFIXES:
+                cure = "give the folder of the images, or a pattern in quotes: 'frames/*.png'"
+            raise InputError(facts.path, "only one picture could be decoded", cure)
         if complete and counts["pictures"] <= first:
             raise InputError(
                 facts.path, f"has only {counts['pictures']} pictures", f"start before picture {first}"
             )
-        if complete and 0 < counts["fields"] < counts["pictures"]:
+        if complete and 0 < counts["fields"] < counts["pictures"] and not everything:
             warnings.append(
                 f"{counts['fields'] // 2} of {counts['decoded']} frames are interlaced, the others are not"
             )

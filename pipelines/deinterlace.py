@@ -14,17 +14,18 @@ import av.filter
 from pipelines.picture import Picture
 
 
-def deinterlace(pictures: Iterable[Picture], mode: str) -> Iterator[Picture]:
+def deinterlace(pictures: Iterable[Picture], mode: str, order: str, everything: bool) -> Iterator[Picture]:
     """mode 'field': two pictures a frame, half a frame apart in time; 'frame': one; 'off': none are touched.
 
+    order: 'tff' or 'bff'; '' takes the pictures' flags. everything: all are interlaced, whatever they say.
     The filter starts at the first interlaced picture. Time stamps must be finite and increasing.
     """
     graph: _Bwdif | None = None
     for picture in pictures:
-        if graph is None and (mode == "off" or not picture.video.interlaced_frame):
+        if graph is None and (mode == "off" or not (everything or picture.video.interlaced_frame)):
             yield picture
             continue
-        graph = graph or _Bwdif(picture.video, mode)
+        graph = graph or _Bwdif(picture.video, mode, order, everything)
         yield from graph.push(picture)
     if graph is not None:
         yield from graph.push(None)
@@ -33,14 +34,16 @@ def deinterlace(pictures: Iterable[Picture], mode: str) -> Iterator[Picture]:
 class _Bwdif:
     """The filter graph. Frame numbers travel through it as time stamps, so that damaged ones cannot confuse it."""
 
-    def __init__(self, like: av.VideoFrame, mode: str) -> None:
+    def __init__(self, like: av.VideoFrame, mode: str, order: str, everything: bool) -> None:
         self._mode = mode
+        self._all = everything
         self._waiting: dict[int, Picture] = {}
         self._frame_s = 0.04
         graph = av.filter.Graph()
         unit = Fraction(1, 1000)
         source = graph.add_buffer(width=like.width, height=like.height, format=like.format, time_base=unit)
-        bwdif = graph.add("bwdif", f"mode=send_{mode}:parity=auto:deint=interlaced")
+        which = "all" if everything else "interlaced"
+        bwdif = graph.add("bwdif", f"mode=send_{mode}:parity={order or 'auto'}:deint={which}")
         sink = graph.add("buffersink")
         source.link_to(bwdif)
         bwdif.link_to(sink)
@@ -77,7 +80,9 @@ class _Bwdif:
                 source_frame=number,
                 pts_s=source.pts_s + half * frame_s / 2,
                 frame_start_s=source.pts_s,
-                field=half if self._mode == "field" and source.video.interlaced_frame else None,
+                field=half
+                if self._mode == "field" and (self._all or source.video.interlaced_frame)
+                else None,
             )
             for old in [n for n in self._waiting if n < number]:
                 del self._waiting[old]

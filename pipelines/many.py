@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.errors import ConfigError, UserError
+from pipelines.stills import is_pattern
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
@@ -93,8 +94,7 @@ def folder_names(clips: Sequence[Path]) -> list[str]:
     names: list[str] = []
     taken = {SUMMARY}
     for clip in clips:
-        pattern = any(sign in clip.name for sign in "%*?[") and not clip.exists()
-        stem = (clip.absolute().parent.name if pattern else clip.stem) or "clip"
+        stem = (clip.absolute().parent.name if is_pattern(clip) else clip.stem) or "clip"
         name, number = stem, 2
         while name.casefold() in taken:
             name, number = f"{stem}-{number}", number + 1

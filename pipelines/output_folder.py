@@ -34,6 +34,8 @@ from pipelines.errors import OutputError
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 
 LOCK = ".lock"
+# EFBIG: the file system's or the account's limit on one file.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 PARTIAL = ".partial-"
 STATE = ("shot.json", "rows.npz")  # what resume needs of a finished shot; not an output
 
@@ -43,6 +45,7 @@ NOT_IN_DIGEST = (
     ("run", "threads"),
     ("decode", "threads"),
     ("decode", "queue_frames"),
+    ("decode", "stdin_max_gb"),
     ("output", "parquet"),
     ("output", "exports"),
 )
@@ -108,7 +111,7 @@ class OutputFolder:
             self._release()
         if self._made and not any(self.out.iterdir()):
             self.out.rmdir()  # an unusable clip leaves nothing behind
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
             raise OutputError(
                 self.out, str(error.strerror).lower(), "make room and run again with --resume"
             ) from error
@@ -227,7 +230,7 @@ def _take_lock(out: Path) -> IO[bytes]:
     for _ in range(100):
         stream = path.open("ab")
         try:
-            _lock_now(stream)
+            lock_now(stream)
         except OSError as error:
             stream.close()
             if error.errno not in (errno.EACCES, errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK):
@@ -244,7 +247,8 @@ def _take_lock(out: Path) -> IO[bytes]:
     raise OutputError(out, "its lock file keeps changing", "see that no other run uses this folder")
 
 
-def _lock_now(stream: IO[Any]) -> None:
+def lock_now(stream: IO[Any]) -> None:
+    """An advisory lock on an open file, until it is closed. Raises OSError: somebody else holds it."""
     try:
         import fcntl
     except ImportError:  # Windows

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -18,22 +17,8 @@ from pipelines.config import DecodeOptions
 from pipelines.deinterlace import deinterlace
 from pipelines.errors import InputError
 from pipelines.picture import Picture
+from pipelines.stills import IMAGE_SUFFIXES, is_pattern, list_images
 from pipelines.timing import Timecode
-
-IMAGE_SUFFIXES = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".tif",
-    ".tiff",
-    ".bmp",
-    ".webp",
-    ".exr",
-    ".dpx",
-    ".jp2",
-    ".ppm",
-    ".pgm",
-)
 
 # Formats that are lists of other files or addresses: a hostile "clip" could read what the user did not name.
 INDIRECT_FORMATS = frozenset(
@@ -59,6 +44,7 @@ class Source(Protocol):
     pixel_aspect: float | None
     timecode: Timecode | None
     says_interlaced: bool
+    field_order: str
     warnings: list[str]
     n_failed: int
 
@@ -67,13 +53,15 @@ class Source(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
     def pictures(self) -> Iterator[Picture]: ...
-    def fields(self, pictures: Iterable[Picture], mode: str) -> Iterator[Picture]: ...
+    def fields(
+        self, pictures: Iterable[Picture], mode: str, order: str, everything: bool
+    ) -> Iterator[Picture]: ...
     def late_warnings(self, n_decoded: int) -> list[str]: ...
 
 
 def open_source(path: Path, options: DecodeOptions) -> Source:
     """A container or images, by what the path is. Raises InputError with file, cause and cure."""
-    if path.is_dir() or (re.search(r"%0?\d*d", path.name) and not path.exists()):
+    if path.is_dir() or is_pattern(path):
         files = list_images(path)
         if not files:
             cause = "no images in it" if path.is_dir() else "no file matches the pattern"
@@ -82,23 +70,6 @@ def open_source(path: Path, options: DecodeOptions) -> Source:
             )
         return ImageSource(path, files, options)
     return ContainerSource(path, options)
-
-
-def list_images(path: Path) -> list[Path]:
-    """The images of a folder, or those that match frames/%06d.png, in the order of the numbers in their names."""
-    if path.is_dir():
-        found = [
-            p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
-        ]
-    else:
-        pattern = re.compile(re.sub(r"%0?\d*d", r"\\d+", re.escape(path.name).replace("\\%", "%")))
-        parent = path.parent if path.parent.is_dir() else None
-        found = [p for p in parent.iterdir() if pattern.fullmatch(p.name)] if parent is not None else []
-
-    def numbers(p: Path) -> list[Any]:
-        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)]
-
-    return sorted(found, key=numbers)
 
 
 class ContainerSource:
@@ -129,8 +100,10 @@ class ContainerSource:
         ratio = stream.sample_aspect_ratio
         self.pixel_aspect = float(ratio) if ratio else None
         self.timecode = self._find_timecode()
-        # FFmpeg's AVFieldOrder: 2 .. 5 are the interlaced ones.
-        self.says_interlaced = int(getattr(stream.codec_context, "field_order", 0) or 0) >= 2
+        # FFmpeg's AVFieldOrder: 2 .. 5 are the interlaced ones; of 4 and 5 the second letter is the order of display.
+        stated = int(getattr(stream.codec_context, "field_order", 0) or 0)
+        self.says_interlaced = stated >= 2
+        self.field_order = {2: "tff", 3: "bff", 4: "bff", 5: "tff"}.get(stated, "")
         others = [s for s in self._container.streams.video if s is not stream and s.codec_context is not None]
         if others:
             self.warnings.append(f"{1 + len(others)} video streams; only stream {stream.index} is used")
@@ -176,8 +149,10 @@ class ContainerSource:
                 continue
             yield from frames
 
-    def fields(self, pictures: Iterable[Picture], mode: str) -> Iterator[Picture]:
-        return deinterlace(pictures, mode)
+    def fields(
+        self, pictures: Iterable[Picture], mode: str, order: str, everything: bool
+    ) -> Iterator[Picture]:
+        return deinterlace(pictures, mode, order, everything)
 
     def late_warnings(self, n_decoded: int) -> list[str]:
         """What is known only after the last picture."""
@@ -237,6 +212,7 @@ class ImageSource:
         self.pixel_aspect = None
         self.timecode = None
         self.says_interlaced = False
+        self.field_order = ""
         self.n_failed = 0
         self.warnings = [f"images carry no time: {options.image_fps:g} pictures/s taken (decode.image_fps)"]
         self._options = options
@@ -273,7 +249,9 @@ class ImageSource:
             yield Picture(video=frame, source_frame=number, pts_s=pts_s, frame_start_s=pts_s)
             number += 1
 
-    def fields(self, pictures: Iterable[Picture], mode: str) -> Iterator[Picture]:
+    def fields(
+        self, pictures: Iterable[Picture], mode: str, order: str, everything: bool
+    ) -> Iterator[Picture]:
         yield from pictures
 
     def late_warnings(self, n_decoded: int) -> list[str]:

@@ -1,0 +1,62 @@
+"""Image sequences: which files a folder or a pattern stands for, in which order. Nothing is opened."""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from pathlib import Path
+from typing import Any
+
+IMAGE_SUFFIXES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".tif",
+    ".tiff",
+    ".bmp",
+    ".webp",
+    ".exr",
+    ".dpx",
+    ".jp2",
+    ".ppm",
+    ".pgm",
+)
+_COUNTER = re.compile(r"%0?\d*d")
+
+
+def is_pattern(path: Path) -> bool:
+    """Whether a path stands for many images: frames/%06d.png or frames/*.png. A file of just that name is that file."""
+    return bool(_COUNTER.search(path.name) or any(sign in path.name for sign in "*?[")) and not path.exists()
+
+
+def list_images(path: Path) -> list[Path]:
+    """The images of a folder, or those that match the pattern, in the order of the numbers in their names.
+
+    A counter (%d, %06d) matches any number; * ? [a-z] match as in a shell, images only.
+    """
+    parent = path if path.is_dir() else path.parent
+    if not parent.is_dir():
+        return []
+    names = [p for p in parent.iterdir() if not p.name.startswith(".")]
+    images = [p for p in names if p.suffix.lower() in IMAGE_SUFFIXES]
+    if path.is_dir():
+        found = images
+    elif _COUNTER.search(path.name):
+        exact = "".join(r"\d+" if i % 2 else re.escape(part) for i, part in enumerate(_split(path.name)))
+        found = [p for p in names if re.fullmatch(exact, p.name)]
+    else:
+        found = [p for p in images if fnmatch.fnmatchcase(p.name, path.name)]
+
+    def numbers(p: Path) -> list[Any]:
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)]
+
+    return sorted(found, key=numbers)
+
+
+def _split(name: str) -> list[str]:
+    """Text, counter, text, counter, ... text."""
+    parts, end = [], 0
+    for match in _COUNTER.finditer(name):
+        parts += [name[end : match.start()], match[0]]
+        end = match.end()
+    return [*parts, name[end:]]
