@@ -254,6 +254,14 @@ def constant_k_sigma(
     return abs(difference) / (1 + z2 / 4), difference
 
 
+def distortion_extreme(solution: Solution) -> bool:
+    """Whether k(f) lies beyond three of its prior's deviations: no broadcast lens is like that."""
+    lens, priors = solution.lens, solution.priors
+    return bool(
+        abs(lens.c0 - priors.c0_mean) > 3 * priors.c0_std or abs(lens.c1 - priors.c1_mean) > 3 * priors.c1_std
+    )
+
+
 def sigma_parts(solution: Solution, graph: HomographyGraph, options: GateOptions) -> dict[str, float]:
     """Parts of the total sigma of the common log f: cluster, signal (10 % x s_px / S10), halves, constant_k;
 
@@ -265,6 +273,9 @@ def sigma_parts(solution: Solution, graph: HomographyGraph, options: GateOptions
     constant_k, difference = (
         constant_k_sigma(solution, graph, options.refine) if options.refits else (0.0, 0.0)
     )
+    if distortion_extreme(solution):
+        # No lens is like that: k(f) soaks up something else, and how well it fits says nothing for it.
+        constant_k = max(constant_k, abs(difference) / 2)
     return {
         "cluster": solution.sigma_mean_log_f,
         "signal": 0.1 * s_px / solution.s10_px if solution.s10_px > 0 else float("inf"),
@@ -373,10 +384,7 @@ def _flags(
         flags.append("unlinked_frames")
     if abs(solution.lens.pp_px[1] - priors.pp_mean_px(graph.size_px)[1]) > 2 * priors.pp_std_y * W:
         flags.append("effective_pp")
-    if (
-        abs(solution.lens.c0 - priors.c0_mean) > 3 * priors.c0_std
-        or abs(solution.lens.c1 - priors.c1_mean) > 3 * priors.c1_std
-    ):
+    if distortion_extreme(solution):
         flags.append("distortion_extreme")
     if max(parts["halves"], parts["constant_k"]) > max(parts["cluster"], parts["signal"]):
         flags.append("subsets_disagree")

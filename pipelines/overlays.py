@@ -181,6 +181,13 @@ class OverlayFinder:
         return full, boxes
 
 
+def both_masks(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """What both masks (True = scene, None = all of it) leave."""
+    if a is None or b is None:
+        return b if a is None else a
+    return a & b
+
+
 def _shrink(gray: NDArray[Any]) -> NDArray[np.float32]:
     """Means of SCALE x SCALE blocks; a remainder at the right and at the bottom is left out."""
     h, w = gray.shape[0] // SCALE, gray.shape[1] // SCALE

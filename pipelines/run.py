@@ -29,7 +29,7 @@ from pipelines.errors import InputError
 from pipelines.exports.exporter import export_for_run
 from pipelines.keyframe_graph import KeyframeImages
 from pipelines.output_folder import OutputFolder, run_digest
-from pipelines.overlays import OverlayFinder
+from pipelines.overlays import OverlayFinder, both_masks
 from pipelines.preparation import PreparedFrame, prepare_frame
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report.build import write_report
@@ -171,9 +171,11 @@ def _first_pass(job: _Job) -> None:
             prepared = None
             if frame is not None:
                 _note(job, frame)
+                own = splitter.screen_mask(frame.index - 2) if job.overlays is not None else None
                 prepared = frame, preparing.submit(
                     prepare_frame, frame.index, frame.pts_s, frame.gray,
-                    selection=selection_of(config.registration), n_levels=job.n_levels, mask=job.mask,
+                    selection=selection_of(config.registration), n_levels=job.n_levels,
+                    mask=both_masks(job.mask, own),
                 )  # fmt: skip
             if ahead is not None:
                 count += 1

@@ -19,8 +19,10 @@ from mosaic.pyramid import build_pyramid
 from mosaic.records import PairFit
 from pipelines.decode import Frame
 from pipelines.moving import MovingFinder, Small
+from pipelines.overlays import both_masks
 from pipelines.retracking import Retracker
 
+HARDLY = np.uint8(2)  # of 255: trust in what stays on the screen
 AHEAD = (
     6  # frames in work at once; each holds its gray, its pyramid and the decoder's picture (8 MB at 1080p)
 )
@@ -34,6 +36,7 @@ def second_pass(
     *,
     planned: set[int],
     mask: NDArray[np.bool_] | None,
+    stays: Callable[[int], NDArray[np.bool_] | None],
     n_levels: int,
     threads: int,
     progress: Callable[[str, int, int | None], None],
@@ -41,18 +44,23 @@ def second_pass(
     """Fits of all frames of the retracker's shot to its keyframes. Pictures of `planned` frames go to the store.
 
     frames: reaches the shot's frames in order, may start before them. mask: usable pixels of all of them.
+    stays: of a frame, (h, w), False = on the screen there for a while (a graphic, a player whom the camera follows):
+    left out of registration, and in the panorama only where there is nothing else.
     """
     observations = retracker.tracker.observations
     first, last = observations[0].frame, observations[-1].frame
     wanted = {o.frame for o in observations if o.reason != "duplicate"}
 
     def register(frame: Frame) -> list[PairFit]:
-        return retracker.register(frame.index, build_pyramid(frame.gray, n_levels=n_levels, mask=mask))
+        pyramid = build_pyramid(frame.gray, n_levels=n_levels, mask=both_masks(mask, stays(frame.index)))
+        return retracker.register(frame.index, pyramid)
 
     def keep(frame: Frame) -> Small | None:
         picture = cache(frame.picture)  # a conversion, and both may ask for it
         if frame.index in planned:
-            store.put(frame.index, picture(), mask)
+            scene = stays(frame.index)
+            trust = None if scene is None else np.where(scene, np.uint8(255), HARDLY)
+            store.put(frame.index, picture(), mask, trust)
         return moving.reduce(frame.index, picture)
 
     def judge(index: int, kept: Future[Small | None]) -> None:

@@ -154,7 +154,8 @@ def solve_shot(
                 Retracker(tracker, approximate, config.registration, tracker.register_options),
                 MovingFinder({p.frame: p for p in placed}, planned, store),
                 store,
-                planned=planned, mask=mask, n_levels=n_levels, threads=config.run.threads or 2, progress=progress,
+                planned=planned, mask=mask, stays=tracker.screen_mask, n_levels=n_levels,
+                threads=config.run.threads or 2, progress=progress,
             )  # fmt: skip
         with timings.measure("poses"):
             solution = _poses(tracker, result, [*fits, *_steps(tracker)])

@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipelines.preparation import PreparedFrame
 from pipelines.tracking import ShotTracker
 
@@ -47,6 +50,11 @@ class ShotSplitter:
         """Motion of the newest frame against its predecessor, px; NaN when unknown."""
         tracker = self._break.tracker if self._break else self._current
         return tracker.observations[-1].motion_px if tracker and tracker.observations else float("nan")
+
+    def screen_mask(self, frame: int) -> NDArray[np.bool_] | None:
+        """(h, w) bool, True = scene, without graphics that stayed at this frame; None: nothing known."""
+        tracker = self._break.tracker if self._break else self._current
+        return None if tracker is None else tracker.screen_mask(frame)
 
     def push(self, look: PreparedFrame) -> Iterator[TrackedShot]:
         """Take the next frame; yields shots that it completes."""

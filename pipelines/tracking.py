@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,9 @@ from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid
 from mosaic.records import FlowGrid, PairFit, PairStatus
 from mosaic.rescue import match_features, phase_correlation
+from mosaic.screen import WIDER, ScreenVotes, moves_more_widely, without_still
 from mosaic.template import PreparedTemplate, SelectionOptions, Template, prepare, with_level
-from mosaic.warp import HomographyFamily
+from mosaic.warp import HomographyFamily, WarpFamily
 from pipelines.bridge import CameraPose, RotationZoomFamily, edge_from_fit, pair_state, pose_from_state
 from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import KeyframeImages, distance_in_widths
@@ -34,6 +36,11 @@ FloatArray = NDArray[np.float64]
 TRUST_SIGMA = 0.3  # relative focal error at which four parameters already beat eight
 FLASH_LOG_GAIN = 0.25  # of a pair of neighbours or of a keyframe: more is a flash, or an exposure on its way
 WEAK_CHAIN = 5  # frames without a direct link to the keyframe before a new keyframe is taken
+RESTING_PX, MOVING_PX = (
+    0.5,
+    1.0,
+)  # motion of the centre: none, if that is true; and surely some, if it was predicted
+SCREEN_LATE = 12  # frames after a graphic's appearance within which the votes find it
 MAX_LINKS = 6  # earlier keyframes that a new one is registered to: nearest and farthest by predicted overlap
 
 # The running estimate only has to stay locked: fewer starts and an earlier stop than the refinement over the shot.
@@ -101,6 +108,8 @@ class ShotTracker:
     observations: list[Observation] = field(default_factory=list)
     calibrator: RunningCalibrator = field(init=False)
     _current: int = -1
+    screen: ScreenVotes = field(init=False)
+    _screen_cells: dict[int, NDArray[np.bool_]] = field(default_factory=dict)
     _previous: PreparedFrame | None = None
     _pose: CameraPose | None = None  # of the previous frame, while calibrated
     _H_previous_keyframe: FloatArray = field(default_factory=lambda: np.eye(3))
@@ -114,6 +123,7 @@ class ShotTracker:
 
     def __post_init__(self) -> None:
         self.calibrator = RunningCalibrator(self.size_px, priors=self.priors, options=RUNNING)
+        self.screen = ScreenVotes(self.size_px)
 
     @property
     def trusts_camera(self) -> bool:
@@ -156,10 +166,18 @@ class ShotTracker:
         self._follow(fits, estimate)
         motion = self._motion(fits)
         self._observe(frame, look.pts_s, "ok", "", motion, estimate)
+        self._look_at_screen(look, fits)
         self._previous = look
         if self._needs_keyframe(fits):
             self._change_keyframe(look, fits)
         return True
+
+    def screen_mask(self, frame: int) -> NDArray[np.bool_] | None:
+        """(h, w) bool, True = scene: without the graphics that were seen to stay at this frame or soon after it.
+
+        Found from pairs of neighbours, a few frames late; None: nothing stayed."""
+        cells = [c for k in range(frame, frame + SCREEN_LATE) if (c := self._screen_cells.get(k)) is not None]
+        return self.screen.full_size(np.logical_and.reduce(cells)) if cells else None
 
     def skip(self, frame: int, pts_s: float, status: str, reason: str) -> None:
         """Note a frame that was bridged or lost, so that the shot's list stays complete."""
@@ -193,6 +211,9 @@ class ShotTracker:
                 levels=coarse,
                 route="still",
             )
+        fit, H_prev = self._beyond_graphics(
+            family, pyramid, fit, H_prev, step, _displacement(step, self.size_px)[0]
+        )
         self.fits.append(fit)
         start = (H_prev if fit.usable else step) @ self._H_previous_keyframe
         keyframe = self.keyframes[self._current]
@@ -243,6 +264,10 @@ class ShotTracker:
             fit, state = align(
                 source, pyramid, pair_state(self._pose, self._pose), dst=frame, levels=coarse, route="still"
             )
+        fit, state = self._beyond_graphics(
+            family, pyramid, fit, state, pair_state(self._pose, predicted),
+            self.size_px[0] * distance_in_widths(self._pose, predicted, self.size_px[0]),
+        )  # fmt: skip
         self.fits.append(fit)
         keyframe = self.keyframes[self._current]
         key_pose = self._keyframe_pose(self._current)
@@ -279,6 +304,42 @@ class ShotTracker:
         elif key_fit.usable:
             self._velocity = (0.0, np.eye(3))
         return fit.usable or key_fit.usable
+
+    def _beyond_graphics(
+        self, family: WarpFamily, pyramid: Pyramid, fit: PairFit, state: Any, start: Any, expected_px: float
+    ) -> tuple[PairFit, Any]:
+        """The pair to the previous frame, fitted again without what stays on the screen where it seems not to move."""
+        # Where the family itself puts the centre: the fit's homography follows the flow, of both scene and graphic.
+        centre = (np.array([self.size_px], np.float64) - 1) / 2
+        where, _, _ = family.warp(state, family.prepare(centre))
+        if not fit.usable or not float(np.hypot(*(where - centre)[0])) <= RESTING_PX:
+            return fit, state
+        assert self._previous is not None
+        kernel = self.register_options.kernel
+        template = without_still(self._previous.template, pyramid, fit, kernel=kernel)
+        if template is None:
+            return fit, state
+        levels = self._coarse_levels(pyramid)
+        second, second_state = align(
+            prepare(template, family), pyramid, start, dst=fit.dst, levels=levels, options=self.register_options,
+            route="beyond graphics",
+        )  # fmt: skip
+        share = 1 / WIDER if expected_px > MOVING_PX else WIDER
+        if second.usable and moves_more_widely(
+            self._previous.template, pyramid, fit, second, share, kernel=kernel
+        ):
+            return second, second_state
+        return fit, state
+
+    def _look_at_screen(self, look: PreparedFrame, fits: list[PairFit]) -> None:
+        assert self._previous is not None
+        step = next((f for f in fits if f.src == self._previous.frame), None)
+        if step is None:
+            return
+        self.screen.look(self._previous.template, look.pyramid, step, kernel=self.register_options.kernel)
+        cells = self.screen.mask()
+        if cells is not None:
+            self._screen_cells[look.frame] = cells
 
     def _rescue(self, look: PreparedFrame) -> bool:
         """Lost: phase correlation, then features, against the previous frame and the keyframe; verified directly."""
