@@ -12,6 +12,7 @@ from typing import Any, Protocol, Self
 
 import av
 import av.error
+import numpy as np
 
 from pipelines.config import DecodeOptions
 from pipelines.deinterlace import deinterlace
@@ -27,7 +28,9 @@ INDIRECT_FORMATS = frozenset(
 
 # FFmpeg plays a text file as a picture of a terminal.
 TS_PACKET, TS_SYNC = 188, 0x47  # bytes, first byte of a transport packet
-CUT_SHORT_S = 0.3  # of the duration that the header promises; sound often runs on for a frame or two
+CUT_SHORT_S = (
+    0.3  # of the duration that the header promises, where there is sound: it often runs on for a frame or two
+)
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf"})
 
 
@@ -81,6 +84,8 @@ class ContainerSource:
         self.n_failed = 0
         self.warnings: list[str] = []
         self._n_other_size = 0
+        self._n_concealed = self._n_corrupt = 0
+        self._first_s = self._last_s = math.nan
         self._container = _open(path)
         try:
             stream = _video_stream(self._container, path)
@@ -128,6 +133,8 @@ class ContainerSource:
                 continue
             unknown = frame.pts is None or not frame.time_base
             pts_s = math.nan if unknown else float(frame.pts * frame.time_base)
+            self._first_s, self._last_s = np.fmin(self._first_s, pts_s), np.fmax(self._last_s, pts_s)
+            self._n_concealed += bool(frame.is_corrupt)
             yield Picture(video=frame, source_frame=number, pts_s=pts_s, frame_start_s=pts_s)
             number += 1
 
@@ -142,6 +149,7 @@ class ContainerSource:
                 return
             if packet is None:
                 return
+            self._n_corrupt += bool(packet.is_corrupt)
             try:
                 frames = packet.decode()
             except av.error.FFmpegError:
@@ -159,15 +167,23 @@ class ContainerSource:
         found = list(self.warnings)
         if self.n_frames_header is not None and self.n_frames_header != n_decoded:
             found.append(f"the header promises {self.n_frames_header} frames, {n_decoded} could be decoded")
-        missing_s = self.duration_s - (n_decoded + self.n_failed) / self.fps
-        if self.n_frames_header is None and missing_s > max(CUT_SHORT_S, 0.02 * self.duration_s):
+        # By time stamps where there are any: at a variable rate counting tells nothing.
+        seen_s = self._last_s - self._first_s + 1 / self.fps
+        if not math.isfinite(seen_s):
+            seen_s = (n_decoded + self.n_failed) / self.fps
+        missing_s = self.duration_s - seen_s
+        alone = len(self._container.streams) == 1
+        allowed_s = 0.6 / self.fps if alone else max(CUT_SHORT_S, 0.02 * self.duration_s)
+        if self.n_frames_header is None and missing_s > allowed_s:
             found.append(
                 f"truncated: the header promises {self.duration_s:.2f} s, the last {missing_s:.2f} s are missing"
             )
         if self.container_name == "mpegts" and _ends_within_packet(self.path):
-            found.append("truncated: it ends within a transport packet; what came before is used")
+            found.append("truncated: it does not end with a whole transport packet; what came before is used")
         if self.n_failed:
             found.append(f"{self.n_failed} damaged packets were left out")
+        if damaged := max(self._n_concealed, self._n_corrupt):
+            found.append(f"{damaged} pictures are damaged: what was lost of them is the decoder's guess")
         if self._n_other_size:
             found.append(f"{self._n_other_size} frames of another size were left out")
         return found
@@ -186,11 +202,14 @@ class ContainerSource:
 
 
 def _ends_within_packet(path: Path) -> bool:
-    """Whether a transport stream of 188-byte packets was cut: recorders write whole packets."""
+    """Whether a transport stream of 188-byte packets does not end with a whole one: recorders write whole packets."""
+    size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(2 * TS_PACKET)
+        stream.seek(max(0, size - TS_PACKET))
+        last = stream.read(1)
     aligned = len(head) == 2 * TS_PACKET and head[0] == head[TS_PACKET] == TS_SYNC
-    return aligned and path.stat().st_size % TS_PACKET != 0
+    return aligned and (size % TS_PACKET != 0 or last != bytes([TS_SYNC]))
 
 
 class ImageSource:

@@ -39,6 +39,7 @@ def test_the_pictures_are_those_that_were_put_in(case: Case, tmp_path: Path) -> 
     if case.scan != "progressive":
         assert facts.scan_seen == case.scan
     assert any(w.startswith("flagged") for w in facts.warnings) == (case.flags != case.scan)
+    assert not any("truncated" in w or "damaged" in w or "gap" in w for w in facts.warnings)
     header = probe(path, shots=False)
     assert header["size_px"] == list(case.size) and header["picture_fps"] == pytest.approx(25 * fields)
 
