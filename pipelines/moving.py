@@ -26,6 +26,7 @@ LOOK_EVERY = 10  # frames between looks for what is stuck to the screen
 SMALL_WIDTH_PX = 480
 STEP_PX = 16  # small px between exact points of a map
 LEAST_OVERLAP = 0.1
+HARDLY = np.uint8(2)  # of 255: trust in what stays on the screen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,9 +43,17 @@ class MovingFinder:
 
     reduce() may run in another thread than push() and finish(), each in the order of the frames.
     placements: approximate ones, by frame number; frames without one are passed over. kept: frames that the store
-    gets."""
+    gets. stays: of a frame, (h, w), False = on the screen there for a while (a graphic, a player whom the camera
+    follows): it is shown only where there is nothing else."""
 
-    def __init__(self, placements: Mapping[int, Placement], kept: set[int], store: FrameStore) -> None:
+    def __init__(
+        self,
+        placements: Mapping[int, Placement],
+        kept: set[int],
+        store: FrameStore,
+        stays: Callable[[int], NDArray[np.bool_] | None],
+    ) -> None:
+        self._stays = stays
         self._placements, self._kept, self._store = placements, kept, store
         width, height = store.size_px
         self._shrink = max(1, round(width / SMALL_WIDTH_PX))
@@ -89,7 +98,13 @@ class MovingFinder:
         while self._ring and now.frame - self._ring[0].frame > REACH:
             self._ring.popleft()
         neighbours = self._neighbours(now)
-        self._store.put_still(now.frame, still_plane(now.rgb, neighbours))
+        still = still_plane(now.rgb, neighbours)
+        scene = self._stays(now.frame)
+        if scene is not None:
+            middle = self._shrink // 2
+            small = scene[middle :: self._shrink, middle :: self._shrink][: still.shape[0], : still.shape[1]]
+            still = np.where(small, still, np.minimum(still, HARDLY))
+        self._store.put_still(now.frame, still)
         if now.frame - self._last_look < LOOK_EVERY:
             return
         self._last_look = now.frame

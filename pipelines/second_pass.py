@@ -22,7 +22,6 @@ from pipelines.moving import MovingFinder, Small
 from pipelines.overlays import both_masks
 from pipelines.retracking import Retracker
 
-HARDLY = np.uint8(2)  # of 255: trust in what stays on the screen
 AHEAD = (
     6  # frames in work at once; each holds its gray, its pyramid and the decoder's picture (8 MB at 1080p)
 )
@@ -44,8 +43,7 @@ def second_pass(
     """Fits of all frames of the retracker's shot to its keyframes. Pictures of `planned` frames go to the store.
 
     frames: reaches the shot's frames in order, may start before them. mask: usable pixels of all of them.
-    stays: of a frame, (h, w), False = on the screen there for a while (a graphic, a player whom the camera follows):
-    left out of registration, and in the panorama only where there is nothing else.
+    stays: of a frame, (h, w), False = on the screen there for a while: left out of registration (see MovingFinder).
     """
     observations = retracker.tracker.observations
     first, last = observations[0].frame, observations[-1].frame
@@ -58,9 +56,7 @@ def second_pass(
     def keep(frame: Frame) -> Small | None:
         picture = cache(frame.picture)  # a conversion, and both may ask for it
         if frame.index in planned:
-            scene = stays(frame.index)
-            trust = None if scene is None else np.where(scene, np.uint8(255), HARDLY)
-            store.put(frame.index, picture(), mask, trust)
+            store.put(frame.index, picture(), mask)
         return moving.reduce(frame.index, picture)
 
     def judge(index: int, kept: Future[Small | None]) -> None:

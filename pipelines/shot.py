@@ -152,7 +152,7 @@ def solve_shot(
             fits = second_pass(
                 frames(),
                 Retracker(tracker, approximate, config.registration, tracker.register_options),
-                MovingFinder({p.frame: p for p in placed}, planned, store),
+                MovingFinder({p.frame: p for p in placed}, planned, store, tracker.screen_mask),
                 store,
                 planned=planned, mask=mask, stays=tracker.screen_mask, n_levels=n_levels,
                 threads=config.run.threads or 2, progress=progress,
