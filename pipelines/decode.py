@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pipelines.config import DecodeOptions
 from pipelines.errors import InputError
 from pipelines.picture import Picture
+from pipelines.pixels import gray_plane, quarter_turns, rgb_picture, yuv_matrix
 from pipelines.scan import LOOK, STEP, judge_scan
 from pipelines.sources import Source, open_source
 from pipelines.stdin import shown_path
@@ -197,13 +198,13 @@ def open_clip(path: str | Path, options: DecodeOptions | None = None) -> Clip:
                 path, "no picture could be decoded", "it is damaged, or its codec is not in this FFmpeg"
             )
         look = (first, *islice(source.pictures(), LOOK - 1)) if options.deinterlace != "off" else (first,)
-        seen = judge_scan(_gray(picture.video, 0)[:, ::STEP].astype(np.float32) for picture in look)
+        seen = judge_scan(gray_plane(picture.video, 0)[:, ::STEP].astype(np.float32) for picture in look)
         return Clip(_facts(source, first, options, seen), options)
 
 
 def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) -> ClipFacts:
     video = first.video
-    turns = _quarter_turns(video)
+    turns = quarter_turns(video)
     warnings = list(source.warnings)
     width, height = (video.width, video.height) if turns % 2 == 0 else (video.height, video.width)
     # The picture's own flag decides: stream headers call plenty of progressive material interlaced.
@@ -245,7 +246,7 @@ def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) ->
             "primaries": int(getattr(video, "color_primaries", UNSPECIFIED)),
             "transfer": int(getattr(video, "color_trc", UNSPECIFIED)),
             "transfer_name": HDR.get(int(getattr(video, "color_trc", UNSPECIFIED)), ""),
-            "rgb_matrix": "none" if video.format.is_rgb else Colorspace(_matrix(video)).name,
+            "rgb_matrix": "none" if video.format.is_rgb else Colorspace(yuv_matrix(video)).name,
         },
         interlaced=interlaced,
         field_order=field_order,
@@ -278,73 +279,6 @@ def _judge_order(flagged: bool, stated: str, seen: str, warnings: list[str]) -> 
             "flagged interlaced, but its first pictures are progressive: each comes twice unless decode.deinterlace off"
         )
     return ""
-
-
-# ---- pixels
-
-
-def _gray(video: av.VideoFrame, turns: int) -> NDArray[Any]:
-    """(h, w) luma of a picture, turned upright, owned and read-only: uint8, or float32 0..255 above 8 bits."""
-    name = video.format.name
-    bits = video.format.components[0].bits
-    if not name.startswith(("yuv4", "yuvj4", "yuva4", "gray", "nv12", "nv21", "nv16")) or name.startswith(
-        "grayf"
-    ):
-        # RGB, packed and shifted layouts: one conversion to a plain plane; of 16 bits, because 10-bit to 8 dithers.
-        packed_yuv = (
-            not video.format.is_rgb and not video.format.has_palette and len(video.format.components) > 2
-        )
-        plain = (
-            ("yuv422p" if packed_yuv else "gray")
-            if bits <= 8
-            else ("yuv444p16le" if packed_yuv else "gray16le")
-        )
-        video = video.reformat(format=plain)
-        name, bits = plain, (8 if bits <= 8 else 16)
-    plane: Any = video.planes[0]  # has the buffer protocol
-    sample: np.dtype[Any] = (
-        np.dtype(np.uint8) if bits <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
-    )
-    padded = np.frombuffer(plane, sample).reshape(plane.height, plane.line_size // sample.itemsize)
-    view = np.rot90(padded[:, : video.width], turns)
-    # The copy detaches the picture from the decoder's pool, so that keeping a frame costs 2 MB, not a pool.
-    gray = (
-        np.array(view, np.uint8, order="C")
-        if bits <= 8
-        else view.astype(np.float32) / np.float32(1 << (bits - 8))
-    )
-    gray = np.ascontiguousarray(gray)
-    gray.setflags(write=False)
-    return gray
-
-
-def _rgb(video: av.VideoFrame, turns: int) -> NDArray[np.uint8]:
-    """(h, w, 3) RGB of a picture, turned upright."""
-    if video.format.is_rgb or video.format.has_palette:
-        rgb = video.to_ndarray(format="rgb24")
-    else:
-        rgb = video.reformat(format="rgb24", src_colorspace=_matrix(video)).to_ndarray()
-    return np.ascontiguousarray(np.rot90(rgb, turns))
-
-
-def _matrix(video: av.VideoFrame) -> Colorspace:
-    """The YCbCr matrix: as tagged; untagged, BT.709 from 720 lines up (FFmpeg would take BT.601: red turns orange)."""
-    tagged = int(video.colorspace)
-    known = {
-        1: Colorspace.ITU709,
-        4: Colorspace.FCC,
-        5: Colorspace.ITU601,
-        6: Colorspace.ITU601,
-        7: Colorspace.SMPTE240M,
-        9: Colorspace.BT2020,
-        10: Colorspace.BT2020,
-    }
-    return known.get(tagged, Colorspace.ITU709 if video.height >= 720 else Colorspace.ITU601)
-
-
-def _quarter_turns(video: av.VideoFrame) -> int:
-    """Quarter turns counter-clockwise that put the picture upright."""
-    return round(int(getattr(video, "rotation", 0) or 0) / 90) % 4
 
 
 def _gop_timecode(video: av.VideoFrame, fps: float) -> Timecode | None:
@@ -477,10 +411,10 @@ def _frames(
                 timecode=str(timecode.after(picture.frame_start_s - start_s)) if timecode is not None else "",
                 source_frame=picture.source_frame,
                 field=picture.field,
-                gray=_gray(picture.video, turns),
+                gray=gray_plane(picture.video, turns),
                 mask=None,
                 pixel_aspect=facts.pixel_aspect,
-                picture=partial(_rgb, picture.video, turns),
+                picture=partial(rgb_picture, picture.video, turns),
             )
         counts["failed_packets"] = source.n_failed
         counts["repaired_pts"] = repair.n_repaired

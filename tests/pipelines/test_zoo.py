@@ -16,7 +16,7 @@ from pipelines.errors import InputError, OutputError
 from pipelines.probe import probe
 from pipelines.stdin import SPOOL, spooled
 from tests.pipelines.clips import ramp, write_clip
-from tests.pipelines.end_to_end import one_line
+from tests.pipelines.end_to_end import one_line, run
 from tests.pipelines.zoo import CASES, FULL, PQ, Case, N, decode, expected, make
 
 CODECS = {"libx264": "h264", "libx265": "hevc", "prores_ks": "prores", "libsvtav1": "av1"}
@@ -154,3 +154,18 @@ def test_pixel_aspect_and_rotation_go_together(tmp_path: Path) -> None:
     with open_clip(path) as clip:
         assert clip.facts.size_px == (48, 64)
         assert clip.facts.pixel_aspect == pytest.approx(45 / 64, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_standard_input_gives_what_the_file_gives(
+    pan_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = ("--run.max_frames", "12", "--panorama.enabled", "false", "-q")
+    by_name = run(pan_clip, tmp_path / "file", *few)
+    monkeypatch.setattr(sys, "stdin", Stdin(pan_clip.read_bytes()))
+    piped = run(Path("-"), tmp_path / "piped", *few)
+    assert (piped.code, piped.stderr) == (by_name.code, "")
+    assert piped.camera_bytes == by_name.camera_bytes
+    assert piped.record["clip"]["path"] == "-"
+    assert piped.record["digest"] == by_name.record["digest"]  # so that --resume knows it again
+    assert not list(piped.out.glob(".*"))

@@ -1,0 +1,74 @@
+"""A decoded picture to arrays: its gray plane, its colours, upright. No file, no time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import av
+import numpy as np
+from av.video.reformatter import Colorspace
+from numpy.typing import NDArray
+
+
+def gray_plane(video: av.VideoFrame, turns: int) -> NDArray[Any]:
+    """(h, w) luma of a picture, turned upright, owned and read-only: uint8, or float32 0..255 above 8 bits."""
+    name = video.format.name
+    bits = video.format.components[0].bits
+    if not name.startswith(("yuv4", "yuvj4", "yuva4", "gray", "nv12", "nv21", "nv16")) or name.startswith(
+        "grayf"
+    ):
+        # RGB, packed and shifted layouts: one conversion to a plain plane; of 16 bits, because 10-bit to 8 dithers.
+        packed_yuv = (
+            not video.format.is_rgb and not video.format.has_palette and len(video.format.components) > 2
+        )
+        plain = (
+            ("yuv422p" if packed_yuv else "gray")
+            if bits <= 8
+            else ("yuv444p16le" if packed_yuv else "gray16le")
+        )
+        video = video.reformat(format=plain)
+        name, bits = plain, (8 if bits <= 8 else 16)
+    plane: Any = video.planes[0]  # has the buffer protocol
+    sample: np.dtype[Any] = (
+        np.dtype(np.uint8) if bits <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
+    )
+    padded = np.frombuffer(plane, sample).reshape(plane.height, plane.line_size // sample.itemsize)
+    view = np.rot90(padded[:, : video.width], turns)
+    # The copy detaches the picture from the decoder's pool, so that keeping a frame costs 2 MB, not a pool.
+    gray = (
+        np.array(view, np.uint8, order="C")
+        if bits <= 8
+        else view.astype(np.float32) / np.float32(1 << (bits - 8))
+    )
+    gray = np.ascontiguousarray(gray)
+    gray.setflags(write=False)
+    return gray
+
+
+def rgb_picture(video: av.VideoFrame, turns: int) -> NDArray[np.uint8]:
+    """(h, w, 3) RGB of a picture, turned upright."""
+    if video.format.is_rgb or video.format.has_palette:
+        rgb = video.to_ndarray(format="rgb24")
+    else:
+        rgb = video.reformat(format="rgb24", src_colorspace=yuv_matrix(video)).to_ndarray()
+    return np.ascontiguousarray(np.rot90(rgb, turns))
+
+
+def yuv_matrix(video: av.VideoFrame) -> Colorspace:
+    """The YCbCr matrix: as tagged; untagged, BT.709 from 720 lines up (FFmpeg would take BT.601: red turns orange)."""
+    tagged = int(video.colorspace)
+    known = {
+        1: Colorspace.ITU709,
+        4: Colorspace.FCC,
+        5: Colorspace.ITU601,
+        6: Colorspace.ITU601,
+        7: Colorspace.SMPTE240M,
+        9: Colorspace.BT2020,
+        10: Colorspace.BT2020,
+    }
+    return known.get(tagged, Colorspace.ITU709 if video.height >= 720 else Colorspace.ITU601)
+
+
+def quarter_turns(video: av.VideoFrame) -> int:
+    """Quarter turns counter-clockwise that put the picture upright."""
+    return round(int(getattr(video, "rotation", 0) or 0) / 90) % 4
