@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.pipelines.end_to_end import digests, small_spec
+from tests.pipelines.end_to_end import digests, pan_spec, small_spec
 from tests.pipelines.zoo import CASES, Case, N, make
 from tests.synth.clip import write_clip
 from tests.synth.paths import PathSpec
@@ -208,7 +208,9 @@ class Runs:
         self.rng = np.random.default_rng(seed)
         path = PathSpec(pan_deg=10, zoom=1.2, zoom_style="in")
         self.clip, other = folder / "two.mp4", folder / "other.mp4"
-        write_clip(self.clip, [small_spec(s, 14, path) for s in (3, 11)])
+        # Two shots of unequal motion: a kill may find the first one finished and the second not.
+        second = small_spec(11, 16, PathSpec(pan_deg=14, zoom=1.2, zoom_style="in"))
+        write_clip(self.clip, [pan_spec(8, 16, 12), second])
         write_clip(other, small_spec(5, 14, path))
         self.log = folder / "log"
         assert self.run(other, folder / "earlier") in (0, 1), self.log.read_text()
@@ -216,6 +218,7 @@ class Runs:
         assert self.run(self.clip, folder / "whole") in (0, 1), self.log.read_text()
         self.seconds = time.perf_counter() - started
         self.expected = visible(folder / "whole")
+        assert "shot-001/pairs.npz" in self.expected, "the clip was not split into its two shots"
 
     def run(
         self, clip: Path, out: Path, *options: str, before: Callable[[], None] | None = None
@@ -244,7 +247,7 @@ class Runs:
             kept = "good: killed when all was published"
         else:
             kept = (
-                "good: killed while names were changed"
+                "two runs mixed: killed while names were changed"
                 if (out / "run.json").exists()
                 else "earlier output damaged"
             )
