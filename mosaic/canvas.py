@@ -20,13 +20,17 @@ class Canvas:
         self._folder, self._left, self._maps = folder, memory_bytes, list[mmap.mmap]()
 
     def zeros(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        """A uint8 array of zeros."""
+        """A uint8 array of zeros. Raises OSError where the disk has no room for it."""
         n_bytes = int(np.prod(shape))
         if n_bytes <= self._left:
             self._left -= n_bytes
             return np.zeros(shape, np.uint8)
         with tempfile.TemporaryFile(prefix="panorama-", dir=self._folder) as file:
-            file.truncate(n_bytes)
+            # Not a sparse file: on a full disk this raises, where writing to a page without a block would kill.
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, n_bytes)
+            else:
+                file.truncate(n_bytes)
             pages = mmap.mmap(file.fileno(), n_bytes)
         self._maps.append(pages)
         return np.frombuffer(pages, np.uint8).reshape(shape)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -173,7 +174,8 @@ class OverlayFinder:
         full[:, blocks.shape[1] :] = full[:, blocks.shape[1] - 1 : blocks.shape[1]]
         full[blocks.shape[0] :] = full[blocks.shape[0] - 1 : blocks.shape[0]]
         if self.options.dilate_px and full.any():
-            full = ndimage.distance_transform_edt(~full) <= self.options.dilate_px
+            away = cv2.distanceTransform((~full).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            full = away <= self.options.dilate_px
         boxes = []
         for rows, columns in ndimage.find_objects(ndimage.label(full)[0]):
             x, y = int(columns.start), int(rows.start)
