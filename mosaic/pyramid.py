@@ -70,12 +70,17 @@ def build_pyramid(
     return Pyramid(levels=tuple(levels), scales=scales, size_px=size_px, mask=small)
 
 
+def block_minimum(plane: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
+    """The least of each side x side block of a plane (h, w); the last ones may be smaller."""
+    # An erosion that looks right and down, at every side-th pixel: twenty times as fast as numpy's min over blocks.
+    least = cv2.erode(plane, np.ones((side, side), np.uint8), anchor=(0, 0))
+    return np.ascontiguousarray(least[::side, ::side], np.uint8)
+
+
 def _quarter_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Mask (h, w) at quarter size, 1 = usable; a quarter pixel is usable only when all of it is."""
     h, w = mask.shape
     if h % 4 == 0 and w % 4 == 0:
-        # An erosion that looks right and down, at every fourth pixel: ten times as fast as the mean over areas.
-        least = cv2.erode(mask.astype(np.uint8), np.ones((4, 4), np.uint8), anchor=(0, 0))
-        return np.ascontiguousarray(least[::4, ::4], np.uint8)
+        return block_minimum(mask.astype(np.uint8), 4)
     size = ((w + 3) // 4, (h + 3) // 4)
     return (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999).astype(np.uint8)

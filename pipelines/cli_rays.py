@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.cli_results import AsJson, Out, print_json, refuse_settings
+from pipelines.csv_input import read_csv_rows
 from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError, OutputError
 
 if TYPE_CHECKING:
@@ -98,15 +99,9 @@ def answer(
 
 def read_points(path: Path) -> tuple[tuple[str, ...], list[int], list[tuple[float, float]]]:
     """(FORWARD or BACK, frames, pairs) of a CSV. Raises InputError: no file, no such columns, no number."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            rows = list(reader)
-            header = reader.fieldnames or []
-    except FileNotFoundError:
-        raise InputError(path, "no such file", "check the path") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, f"cannot be read ({error})", "it must be a CSV") from None
+    header, rows = read_csv_rows(
+        path, "it must be a CSV", encoding="utf-8-sig"
+    )  # spreadsheets write a mark first
     cure = "it needs frame, x_px, y_px, or frame, pan_deg, tilt_deg"
     columns = next((c for c in (FORWARD, BACK) if {"frame", *c} <= set(header)), None)
     if columns is None or not rows:

@@ -6,7 +6,6 @@ each shot has its true attitude. Nothing else is fitted: focal lengths, zooms an
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from calib.distortion import undistorted_radius
 from calib.rotation import from_pan_tilt_roll, to_pan_tilt_roll
 from pipelines.archive import read_camera_csv, read_run
+from pipelines.csv_input import read_csv_rows
 from pipelines.errors import InputError
 from pipelines.records import CameraTable, ShotRecord
 
@@ -74,15 +74,7 @@ def compare_run(out: str | Path, truth: str | Path) -> dict[str, Any]:
 def read_truth(path: str | Path) -> dict[str, FloatArray]:
     """Columns of a known track, units as camera.csv. Raises InputError: no file, a column missing, no number."""
     path = Path(path)
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            reader = csv.DictReader(stream)
-            rows = list(reader)
-            header = reader.fieldnames or []
-    except FileNotFoundError:
-        raise InputError(path, "no such file", "check the path") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, f"cannot be read ({error})", "it must be a CSV of a camera track") from None
+    header, rows = read_csv_rows(path, "it must be a CSV of a camera track")
     missing = [name for name in TRUTH_COLUMNS if name not in header]
     if missing or not rows:
         cause = f"has no column {missing[0]}" if missing else "has no rows"

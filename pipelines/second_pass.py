@@ -22,9 +22,8 @@ from pipelines.moving import MovingFinder, Small
 from pipelines.overlays import both_masks
 from pipelines.retracking import Retracker
 
-AHEAD = (
-    6  # frames in work at once; each holds its gray, its pyramid and the decoder's picture (8 MB at 1080p)
-)
+# Frames in work at once; each holds its gray, its pyramid and the decoder's picture (8 MB at 1080p).
+AHEAD = 6
 
 
 def second_pass(

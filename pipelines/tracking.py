@@ -332,9 +332,8 @@ class ShotTracker:
         return fit, state
 
     def _look_at_screen(self, look: PreparedFrame, fits: list[PairFit]) -> None:
-        assert self._previous is not None
-        step = next((f for f in fits if f.src == self._previous.frame), None)
-        if step is None:
+        step = self._step_fit(fits)
+        if step is None or self._previous is None:
             return
         self.screen.look(self._previous.template, look.pyramid, step, kernel=self.register_options.kernel)
         cells = self.screen.mask()
@@ -484,8 +483,7 @@ class ShotTracker:
         else:
             self._pose = None
         direct = next((f for f in fits if f.src == self._current), None)
-        assert self._previous is not None
-        step = next((f for f in fits if f.src == self._previous.frame), None)
+        step = self._step_fit(fits)
         if direct is not None:
             self._chain, self._n_chained = direct, 0
         elif step is not None and self._chain is not None:
@@ -506,11 +504,13 @@ class ShotTracker:
         return False
 
     def _motion(self, fits: list[PairFit]) -> float:
+        step = self._step_fit(fits)
+        return _displacement(self._H_step if step is None else step.H_dst_src, self.size_px)[0]
+
+    def _step_fit(self, fits: list[PairFit]) -> PairFit | None:
+        """The first of the fits that comes from the previous frame."""
         assert self._previous is not None
-        for fit in fits:
-            if fit.src == self._previous.frame:
-                return _displacement(fit.H_dst_src, self.size_px)[0]
-        return _displacement(self._H_step, self.size_px)[0]
+        return next((f for f in fits if f.src == self._previous.frame), None)
 
     def _observe(
         self,
