@@ -109,21 +109,32 @@ def fit_homography_to_flow(
     H_start: the std, in px at the points, that a direction without evidence keeps. Returns (H det 1, information of
     vec(H) of that scale, row-major).
     """
-    H0 = normalise_homography(H_start)
+    return _fit_homography(
+        np.ascontiguousarray(src), np.ascontiguousarray(dst), np.ascontiguousarray(info),
+        normalise_homography(H_start), float(ridge_px) ** -2,
+    )  # fmt: skip
+
+
+@nb.njit(cache=True, nogil=True)
+def _fit_homography(src, dst, info, H0, ridge):  # type: ignore[no-untyped-def]
+    """The Gauss-Newton loop of `fit_homography_to_flow`."""
     H = H0.copy()
     N = np.zeros((9, 9))
     for _ in range(3):
-        N, g, R, rg = _homography_normal_equations(H, H0, src, dst, info, ridge_px**-2)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(N + R), 1e-300))
-        M = (N + R) * scale[:, None] * scale[None, :]
+        N, g, R, rg = _homography_normal_equations(H, H0, src, dst, info, ridge)
+        total = N + R
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
         # vec(H) has one free scale: a unit of curvature along H itself keeps the system regular.
-        h = H.ravel() / scale
-        h /= np.linalg.norm(h)
-        step = scale * np.linalg.solve(M + np.outer(h, h) + 1e-12 * np.eye(9), scale * (g + rg))
+        h = H.copy().reshape(9) / scale
+        h /= np.sqrt((h * h).sum())
+        M = total * scale.reshape(9, 1) * scale.reshape(1, 9) + h.reshape(9, 1) * h.reshape(1, 9)
+        step = scale * np.linalg.solve(M + 1e-12 * np.eye(9), scale * (g + rg))
         if not np.all(np.isfinite(step)):
             break
-        H = normalise_homography(H + step.reshape(3, 3))
-        if step @ (N + R) @ step < 1e-4:  # far below a tenth of its own standard deviation
+        H = H + step.reshape(3, 3)
+        det = np.linalg.det(H)
+        H = H / (np.sign(det) * abs(det) ** (1.0 / 3.0))
+        if step @ total @ step < 1e-4:  # far below a tenth of its own standard deviation
             break
     return H, N
 

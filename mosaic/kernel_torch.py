@@ -13,6 +13,8 @@ from kornia.filters import spatial_gradient
 from numpy.typing import NDArray
 from torch.nn.functional import grid_sample
 
+from mosaic.photometric import NORMAL_QUANTILE, SCALE_QUANTILE
+
 FloatArray = NDArray[np.float64]
 
 
@@ -135,3 +137,77 @@ def accumulate_cells(
     S = summed(torch.cat([texture[:, None], texture[:, None] * places], dim=1))
     counts = summed(torch.stack([torch.ones_like(w), (w > 0.3).double()], dim=1))
     return A, b, S, counts
+
+
+def linearise_cells(
+    level: NDArray[np.generic],
+    sx: float,
+    sy: float,
+    dst: FloatArray,
+    shift: FloatArray,
+    cell: NDArray[np.int64],
+    *rest: Any,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], FloatArray]:
+    """See kernel_numba.linearise_cells: residuals (n,), ESM gradients (n, 2), points (n, 2)."""
+    moved = dst + shift[cell]
+    return *linearise(level, sx, sy, moved, *rest), moved
+
+
+def robust_scale(residual: NDArray[np.float32]) -> tuple[float, int]:
+    """See kernel_numba.robust_scale: scale, count."""
+    r = torch.from_numpy(residual).abs()
+    r = r[r.isfinite()]
+    if len(r) == 0:
+        return float("nan"), 0
+    quantile = torch.kthvalue(r, int(SCALE_QUANTILE * len(r)) + 1).values
+    return max(float(quantile) / NORMAL_QUANTILE, 0.5), len(r)
+
+
+def shifted_residuals(
+    level: NDArray[np.generic],
+    sx: float,
+    sy: float,
+    dst: FloatArray,
+    shifts: FloatArray,
+    stride: int,
+    values: NDArray[np.float32],
+    gain: float,
+    offset: float,
+    *masks: Any,
+) -> NDArray[np.float32]:
+    """See kernel_numba.shifted_residuals: (m k,)."""
+    seen = [sample(level, sx, sy, dst[::stride] + shift, *masks) for shift in shifts]
+    return np.concatenate([values[::stride] - (gain * s + offset) for s in seen]).astype(np.float32)
+
+
+def cell_steps(
+    A: FloatArray, b: FloatArray, variance: float, max_std: float
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """See kernel_numba.cell_steps: step (c, 2), eigenvectors (c, 2, 2), variances (c, 2), known (c, 2)."""
+    values, vectors = torch.linalg.eigh(torch.from_numpy(A))
+    values = values.clamp(min=1e-12)
+    std2 = variance / values
+    known = std2 < max_std**2
+    along = torch.einsum("cji,cj->ci", vectors, torch.from_numpy(b))
+    step = torch.einsum("cij,cj->ci", vectors, torch.where(known, along / values, 0.0))
+    return step.numpy(), vectors.numpy(), std2.numpy(), known.numpy()
+
+
+def cell_scores(
+    residual: NDArray[np.float32],
+    G: NDArray[np.float32],
+    J: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    cell: NDArray[np.int64],
+    n_cells: int,
+) -> FloatArray:
+    """See kernel_numba.cell_scores: (c, p)."""
+    used = weight > 0
+    wr = torch.from_numpy((weight[used] * residual[used]).astype(np.float64))
+    rows = torch.einsum(
+        "nk,nkp->np",
+        torch.from_numpy(G[used].astype(np.float64)),
+        torch.from_numpy(J[used].astype(np.float64)),
+    )
+    total = torch.zeros((n_cells, rows.shape[1]), dtype=torch.float64)
+    return total.index_add_(0, torch.from_numpy(cell[used]), wr[:, None] * rows).numpy()

@@ -70,6 +70,50 @@ def test_kernels_agree_term_by_term(pair):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-4)
 
 
+def test_kernels_agree_on_what_is_measured_after_the_alignment(pair):
+    """Scale, null, and the cells' steps and sums: with cells moved one by one, and pixels outside and masked."""
+    source, target, H = pair
+    family = HomographyFamily(size_px=SIZE)
+    level = build_template(source, 0).levels[0]
+    where, J, A = family.warp(H, family.prepare(level.src_px))
+    shift = np.random.default_rng(1).uniform(-1.5, 1.5, (40, 2))
+    masks = mask_arguments(target)
+    picture = (target.levels[0], *target.scales[0])
+    found = []
+    for kernel in (kernel_numba, kernel_torch):
+        r, G, moved = kernel.linearise_cells(
+            *picture, where, shift, level.cell, A, level.values, level.gradients, 1.1, -3.0, *masks
+        )
+        np.testing.assert_array_equal(moved, where + shift[level.cell])
+        scale, n = kernel.robust_scale(r)
+        assert 0 < n == np.isfinite(r).sum() < len(r)
+        w = kernel.robust_weights(r, np.float32(scale), True)
+        sums, b, _, _ = kernel.accumulate_cells(r, G, w, level.src_px, moved, level.cell, 40)
+        limit = 1.01 * float(np.sqrt(np.median(kernel.cell_steps(sums, b, scale**2, 1.0)[2])))
+        step, vectors, std2, known = kernel.cell_steps(sums, b, scale**2, limit)
+        assert known.any() and not known.all()
+        spread = (vectors * np.where(known, std2, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+        scores = kernel.cell_scores(r, G, J, w, level.cell, 40)
+        np.testing.assert_allclose(scores.sum(axis=0), kernel.accumulate(r, G, J, w)[1], rtol=1e-5, atol=1e-3)
+        null = kernel.shifted_residuals(
+            *picture, where, np.array([[5.0, 2.0], [-40.0, 3.0]]), 3, level.values, 1.1, -3.0, *masks
+        )
+        found.append((scale, step, spread, scores, np.nan_to_num(null)))
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-3)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 1000])
+def test_the_robust_scale_is_the_quantile(n):
+    r = np.random.default_rng(n).normal(0, 7, n + 1).astype(np.float32)
+    r[n // 2] = np.nan
+    expected = np.sort(np.abs(r[np.isfinite(r)]))[int(0.3 * n)] / 0.38532
+    for kernel in (kernel_numba, kernel_torch):
+        scale, count = kernel.robust_scale(r)
+        assert count == n and scale == pytest.approx(max(expected, 0.5), rel=1e-6)
+        assert kernel.robust_scale(np.full(3, np.nan, np.float32))[1] == 0
+
+
 def test_kernels_give_the_same_homography(pair):
     source, target, H = pair
     prepared = prepare(build_template(source, 0), HomographyFamily(size_px=SIZE))

@@ -1,0 +1,52 @@
+"""What an alignment is worth: its residuals against those of the pictures shifted, and the information it holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mosaic.level import LevelPair, Linearised
+from mosaic.records import N_CELLS, FloatArray
+
+_SHIFTS = np.array([[13.0, 5.0], [-13.0, -5.0], [7.0, -11.0], [-7.0, 11.0]])  # px at W = 1280
+
+
+def alignment_score(pair: LevelPair, fine: Linearised) -> float:
+    """Residual scale over the residual scale of the same pair shifted by a dozen pixels (the null); NaN: unknown."""
+    level = pair.pixels
+    stride = max(1, len(level.values) // 1500)
+    shifts = _SHIFTS * max(1.0, pair.target.size_px[0] / 1280.0)
+    null, n = pair.kernel.robust_scale(
+        pair.kernel.shifted_residuals(
+            *pair.picture, fine.dst, shifts, stride, level.values, pair.gain, pair.offset, *pair.masks
+        )
+    )
+    return fine.scale / null if n >= 40 else float("nan")
+
+
+def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: FloatArray) -> FloatArray:
+    """Information (2k, 2k) px^-2 of where k = 4 anchors land, from the pixels' normal equations at `fine`.
+
+    Residuals are no independent draws: the blur, the codec and whoever walks through the picture tie neighbours
+    together. So the variance of the normal equations' right side is not sigma^2 N but what the 40 cells' own sums say
+    it is (calibration.md 7.3): kappa = trace(N^-1 sum_c s_c s_c^T) / p, a mean over the p directions because 40 cells
+    cannot tell them apart. Zeros where the pixels do not determine the anchors.
+    """
+    level, kernel = pair.pixels, pair.kernel
+    weight = kernel.robust_weights(fine.residual, np.float32(fine.scale), True)
+    N, _, _ = kernel.accumulate(fine.residual, fine.G, fine.J, weight)
+    scores = kernel.cell_scores(fine.residual, fine.G, fine.J, weight, level.cell, N_CELLS)
+    p = len(N)
+    n_cells = int(np.any(scores != 0, axis=1).sum())
+    _, J, _ = pair.source.family.warp(state, pair.source.family.prepare(anchors))
+    J8 = J.reshape(-1, p).astype(np.float64)
+    unknown = np.zeros((len(J8), len(J8)))
+    if n_cells * 2 <= p or np.linalg.matrix_rank(N, hermitian=True) < p:
+        return unknown
+    # 2 n equations of p parameters: the sums at the optimum are smaller than the errors by that share.
+    share = 2 * n_cells / (2 * n_cells - p)
+    kappa = share * float(np.einsum("ca,ca->", scores, np.linalg.solve(N, scores.T).T)) / p
+    variance = max(kappa, fine.scale**2)
+    back = np.linalg.inv(J8)
+    return back.T @ (N / variance) @ back
