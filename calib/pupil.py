@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.level import LevelOptions, level
+from calib.parallax import Parallax
 from calib.problem import Loss, Packed, PriorTerms, State, linearise, pack, residuals
-from calib.records import HomographyGraph, Level, Solution
+from calib.records import HomographyGraph, Solution
 from calib.refine import RefineOptions, refine
 from calib.solver import Layout, NormalEquations
 
@@ -25,6 +26,7 @@ SENTENCES = {
     "ok": "The parallax of the pupil was estimated and taken out.",
     "head_axis_unknown": "The pan axis of the head is not known, so near and far cannot be told apart.",
     "not_significant": "The measurements show no parallax of a pupil.",
+    "not_better": "The measurements fit no better with the parallax of a pupil.",
     "not_converged": "The fit with a pupil did not settle.",
 }
 
@@ -35,8 +37,9 @@ class PupilOptions:
 
     over_height, over_stand: prior of offset / height and offset / distance, and the start: .4 m (real-footage.md 6.5)
     over 15 m and over 80 m; their _std: as much again. min_sigmas: of either ratio, with the edges' common errors in,
-    before it is believed. max_rounds: of estimating the ratios and refining again. tilt_std_deg: worst error of the
-    head's axis that still serves.
+    before it is believed. min_gain: fall of the cost, in units of the edges' common errors, that it must bring: the
+    prior alone must not decide. max_rounds: of estimating the ratios and refining again. tilt_std_deg: worst error of
+    the head's axis that still serves.
     """
 
     over_height: float = 0.027
@@ -44,6 +47,7 @@ class PupilOptions:
     over_stand: float = 0.005
     over_stand_std: float = 0.005
     min_sigmas: float = 3.0
+    min_gain: float = 9.0
     max_rounds: int = 5
     tilt_std_deg: float = 2.0
     refine: RefineOptions = field(default_factory=RefineOptions)
@@ -54,7 +58,8 @@ class PupilFit:
     """over_height, over_stand: pupil offset over the axis' height above the pitch and over the stand's distance, with
 
     standard deviations. accepted, reason (key of SENTENCES), sentence. solution, graph: refined on the measurements
-    without the parallax, and those; the ones handed in where it was not accepted.
+    without the parallax, and those; the ones handed in where it was not accepted. parallax: the scene in the axes of
+    `solution`, None where not accepted. shift_log_f: what taking it out did to the mean log f.
     """
 
     over_height: float
@@ -66,25 +71,23 @@ class PupilFit:
     sentence: str
     solution: Solution
     graph: HomographyGraph
+    parallax: Parallax | None
+    shift_log_f: float
 
 
-def parallax_px(packed: Packed, solution: Solution, head: Level, ratios: Array) -> Array:
-    """Displacement (E, m, 2) px of each point of a in b by a pupil with ratios (over_height, over_stand); NaN behind.
+def parallax_px(packed: Packed, solution: Solution, parallax: Parallax) -> Array:
+    """Displacement (E, m, 2) px of each point of a in b by a pupil; NaN behind the camera.
 
-    With f the optical axes and d the ray of a, all in head axes: b sees d + max(over_height down, over_stand level)
-    (f_a - f_b), where down and level are the ray's components towards the pitch and along the ground.
+    With f the optical axes and d the ray of a, all in head axes: b sees d + nearness(d) (f_a - f_b).
     """
-    to_head = head.R_head_world.T
+    to_head = parallax.R_head_world.T
     lens, (ia, ib) = solution.lens, (packed.ia, packed.ib)
     a, _, _ = packed.points()
     R_a, R_b = solution.R[ia] @ to_head, solution.R[ib] @ to_head
     ideal = lens.undistort(a, solution.log_f[ia][:, None])
     homogeneous = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], -1)
     rays = homogeneous @ np.swapaxes(np.linalg.inv(lens.K(solution.log_f[ia])), 1, 2) @ R_a
-    down = np.maximum(rays[..., 1], 0.0)
-    along = np.hypot(rays[..., 0], rays[..., 2])
-    nearness = np.maximum(ratios[0] * down, ratios[1] * along)
-    moved = rays + nearness[..., None] * (R_a[:, 2] - R_b[:, 2])[:, None]
+    moved = rays + parallax.nearness(rays)[..., None] * (R_a[:, 2] - R_b[:, 2])[:, None]
     K_b = lens.K(solution.log_f[ib])
 
     def seen(directions: Array) -> Array:
@@ -97,13 +100,14 @@ def parallax_px(packed: Packed, solution: Solution, head: Level, ratios: Array) 
     return seen(moved) - seen(rays)
 
 
-def without_parallax(
-    graph: HomographyGraph, solution: Solution, head: Level, ratios: Array
-) -> HomographyGraph:
-    """The graph with the parallax taken out of grid_b; H, only a start value, as it was."""
+def without_parallax(graph: HomographyGraph, solution: Solution, parallax: Parallax) -> HomographyGraph:
+    """The graph with the parallax taken out of grid_b; H, only a start value, as it was.
+
+    solution: cameras of the graph's frames, in the world axes of `parallax`; edges of unknown cameras stay.
+    """
     usable = [k for k, e in enumerate(graph.edges) if _known(solution, e.a) and _known(solution, e.b)]
     packed = pack(graph, [graph.edges[k] for k in usable])
-    shift = np.nan_to_num(parallax_px(packed, solution, head, ratios))
+    shift = np.nan_to_num(parallax_px(packed, solution, parallax))
     edges = list(graph.edges)
     for row, k in enumerate(usable):
         edges[k] = replace(edges[k], grid_b=edges[k].grid_b - shift[row, : len(edges[k].grid_b)])
@@ -115,7 +119,7 @@ def _known(solution: Solution, frame: int) -> bool:
 
 
 def _step(
-    graph: HomographyGraph, solution: Solution, head: Level, ratios: Array, options: PupilOptions
+    graph: HomographyGraph, solution: Solution, parallax: Parallax, options: PupilOptions
 ) -> tuple[Array, Array]:
     """Gauss-Newton step of the ratios with everything else re-optimised, and their covariance; graph as measured."""
     edges = [e for e, ok in zip(graph.edges, solution.edge_ok, strict=True) if ok]
@@ -127,11 +131,17 @@ def _step(
     terms = PriorTerms(solution.priors, graph.size_px, graph.frames, free)
     layout = Layout(packed, solution.index(solution.reference), free)
     loss = Loss("huber", np.array([max(1.0, float(np.sqrt(solution.chi2_dof)))]))
-    shift = np.nan_to_num(parallax_px(packed, solution, head, ratios))
+    ratios = np.array([parallax.over_height, parallax.over_stand])
+
+    def displaced(at: Array) -> Array:
+        there = replace(parallax, over_height=float(at[0]), over_stand=float(at[1]))
+        return parallax_px(packed, solution, there)
+
+    shift = np.nan_to_num(displaced(ratios))
     h = np.array([1e-4, 2e-5])
     slopes = []
     for k, unit in enumerate(np.eye(2)):
-        up, down = (parallax_px(packed, solution, head, ratios + sign * h * unit) for sign in (1, -1))
+        up, down = (displaced(ratios + sign * h * unit) for sign in (1, -1))
         slopes.append(np.nan_to_num(up - down) / (2 * h[k]))
     rx, ry, J = residuals(packed, state, jacobian=True)
     known = packed.dof > 0
@@ -153,7 +163,7 @@ def _step(
     normal = np.einsum("em,kemx,lemx->kl", weight, P, P) - coupling @ eliminated.T
     gradient = np.einsum("em,kemx,emx->k", weight, P, e) - eliminated @ equations.gradient[0]
     # The prior is of the measurements' own scale, so that it does not fade as edges that share errors are added.
-    kappa = max(float(np.nanmean(solution.edge_kappa[solution.edge_ok])), solution.chi2_dof, 1.0)
+    kappa = _common(solution)
     information = normal / kappa + np.diag(prior)
     mean = np.array([options.over_height, options.over_stand])
     return np.linalg.solve(information, gradient / kappa + prior * (mean - ratios)), np.linalg.inv(
@@ -174,7 +184,7 @@ def fit_pupil(graph: HomographyGraph, solution: Solution, options: PupilOptions 
         raise ValueError("fit_pupil() needs the graph that the solution was refined on")
     loose = LevelOptions(max_std_rad=float(np.deg2rad(options.tilt_std_deg)), max_residual_ratio=np.inf)
     # From the prior: at 0 the nearer surface is undefined, and where the pitch ends must be about right from the start.
-    best, corrected, cov = solution, graph, np.full((2, 2), np.nan)
+    best, corrected, cov, parallax = solution, graph, np.full((2, 2), np.nan), None
     ratios = np.array([options.over_height, options.over_stand])
     for _ in range(options.max_rounds):
         if not best.converged or not np.isfinite(best.log_f).all():
@@ -182,9 +192,13 @@ def fit_pupil(graph: HomographyGraph, solution: Solution, options: PupilOptions 
         head = level(best, loose)
         if not head.observable:
             return _refused(solution, graph, "head_axis_unknown")
-        step, cov = _step(graph, best, head, ratios, options)
+        at = Parallax(
+            over_height=float(ratios[0]), over_stand=float(ratios[1]), R_head_world=head.R_head_world
+        )
+        step, cov = _step(graph, best, at, options)
         ratios = np.maximum(ratios + np.clip(step, -0.02, 0.02), 1e-5)
-        corrected = without_parallax(graph, best, head, ratios)
+        parallax = replace(at, over_height=float(ratios[0]), over_stand=float(ratios[1]))
+        corrected = without_parallax(graph, best, parallax)
         best = refine(corrected, start=best, priors=solution.priors,
                       options=replace(options.refine, reference=best.reference))  # fmt: skip
         if np.all(np.abs(step) < 0.1 * np.sqrt(np.diagonal(cov))):
@@ -194,11 +208,18 @@ def fit_pupil(graph: HomographyGraph, solution: Solution, options: PupilOptions 
     std = np.sqrt(np.diagonal(cov))
     if not (ratios > options.min_sigmas * std).any():
         return _refused(solution, graph, "not_significant", ratios, std)
+    if not (solution.cost - best.cost) / _common(solution) > options.min_gain:
+        return _refused(solution, graph, "not_better", ratios, std)
     return PupilFit(
         over_height=float(ratios[0]), over_stand=float(ratios[1]), over_height_std=float(std[0]),
         over_stand_std=float(std[1]), accepted=True, reason="ok", sentence=SENTENCES["ok"], solution=best,
-        graph=corrected,
+        graph=corrected, parallax=parallax, shift_log_f=float(np.mean(best.log_f - solution.log_f)),
     )  # fmt: skip
+
+
+def _common(solution: Solution) -> float:
+    """How many stated variances an edge's common errors make of one: measurements that share them count once."""
+    return max(float(np.nanmean(solution.edge_kappa[solution.edge_ok])), solution.chi2_dof, 1.0)
 
 
 def _refused(
@@ -213,5 +234,5 @@ def _refused(
     return PupilFit(
         over_height=float(ratios[0]), over_stand=float(ratios[1]), over_height_std=float(std[0]),
         over_stand_std=float(std[1]), accepted=False, reason=reason, sentence=SENTENCES[reason], solution=solution,
-        graph=graph,
+        graph=graph, parallax=None, shift_log_f=0.0,
     )  # fmt: skip

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib import rotation
+from calib.parallax import Parallax
 from calib.records import HomographyEdge, HomographyGraph, Lens
 from mosaic.records import PairFit
 
@@ -255,13 +256,17 @@ def homography_graph(frames: ArrayLike, fits: Iterable[PairFit], size_px: tuple[
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraPlacement:
-    """A solved camera as the compositor sees it: rays of the shot world to raw pixels and back (mosaic's Placement)."""
+    """A solved camera as the compositor sees it: rays of the shot world to raw pixels and back (mosaic's Placement).
+
+    parallax, in the axes of the rays: of a pupil in front of the pan axis. Rays are those of the pan axis then.
+    """
 
     frame: int
     size_px: tuple[int, int]
     lens: Lens
     pose: CameraPose
     blur_px: float = 0.0
+    parallax: Parallax | None = None
 
     @property
     def px_per_rad(self) -> float:
@@ -270,7 +275,10 @@ class CameraPlacement:
 
     def ray_to_pixel(self, rays: ArrayLike) -> FloatArray:
         """World rays (..., 3) to raw px (..., 2); NaN behind the camera or outside the distortion model."""
-        axes = np.asarray(rays, np.float64) @ self.pose.R.T
+        directions = np.asarray(rays, np.float64)
+        if self.parallax is not None:
+            directions = self.parallax.from_pupil(directions, self.pose.R[2])
+        axes = directions @ self.pose.R.T
         f = np.exp(self.pose.log_f)
         with np.errstate(divide="ignore", invalid="ignore"):
             q = np.where(axes[..., 2:] > 1e-6, axes[..., :2] / axes[..., 2:], np.nan)
@@ -282,4 +290,5 @@ class CameraPlacement:
         f = np.exp(self.pose.log_f)
         d = (self.lens.undistort(xy, self.pose.log_f) - self.lens.pp_px) / np.array([f, f / self.lens.aspect])
         ray = np.concatenate([d, np.ones((*d.shape[:-1], 1))], axis=-1)
-        return (ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ self.pose.R
+        directions = (ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ self.pose.R
+        return directions if self.parallax is None else self.parallax.from_axis(directions, self.pose.R[2])

@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.parallax import Parallax
+from calib.pupil import PupilFit
 from calib.records import HomographyGraph, Priors, Solution
 from calib.refine import RefineOptions, refine
 from mosaic.estimator import RegisterOptions, align
@@ -79,13 +81,21 @@ class KeyframeOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeyframeResult:
-    """The refined keyframes with the graph and options they were refined with, its fits, and the rounds it took."""
+    """The refined keyframes with the graph and options they were refined with, its fits, and the rounds it took.
+
+    pupil: what was found of a pupil's parallax, which is then out of solution and graph (not out of the fits)."""
 
     solution: Solution
     graph: HomographyGraph
     fits: tuple[PairFit, ...]
     rounds: int
     options: RefineOptions
+    pupil: PupilFit | None = None
+
+    @property
+    def parallax(self) -> Parallax | None:
+        """Of the pupil, in the solution's axes; None where none was found."""
+        return None if self.pupil is None else self.pupil.parallax
 
 
 def pose_of(solution: Solution, frame: int) -> CameraPose | None:
@@ -128,7 +138,7 @@ def refine_keyframes(
     fits = tuple(f for f in first_fits if f.src in templates and f.dst in templates)
     rounds = 0
     for rounds in range(1, options.max_rounds + 1):
-        new = _register_pairs(templates, images, solution, n_levels, mask, options)
+        new = register_pairs(templates, images, solution, n_levels, mask, options)
         if not any(f.usable for f in new):
             break
         new_graph = homography_graph(frames, new, size_px)
@@ -177,7 +187,7 @@ def _without_lens(
     solution = refine(graph, priors=priors, options=plain)
     fits = tuple(f for f in first_fits if f.src in templates and f.dst in templates)
     if np.isfinite(solution.log_f).any():
-        new = _register_pairs(templates, images, solution, n_levels, mask, options)
+        new = register_pairs(templates, images, solution, n_levels, mask, options)
         # Pairs of the first pass hold the graph together; refined ones of the same frames replace them.
         better = {(f.src, f.dst) for f in new if f.usable}
         fits = (*(f for f in fits if (f.src, f.dst) not in better), *new)
@@ -198,7 +208,7 @@ def _best_linked(graph: HomographyGraph) -> int:
     return max((int(f) for f in graph.frames), key=lambda f: (len(part[f]), -f))
 
 
-def _register_pairs(
+def register_pairs(
     templates: dict[int, Template],
     images: KeyframeImages,
     solution: Solution,
@@ -206,6 +216,7 @@ def _register_pairs(
     mask: NDArray[np.bool_] | None,
     options: KeyframeOptions,
 ) -> list[PairFit]:
+    """Every keyframe to earlier ones that see the same view, through the solution's lens, from its cameras."""
     poses = {frame: pose for frame in templates if (pose := pose_of(solution, frame)) is not None}
     width = solution.lens.size_px[0]
     prepared = {

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib.gates import GateOptions, judge
 from calib.level import level
+from calib.parallax import Parallax
 from calib.poses import solve_poses
 from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
@@ -28,9 +29,16 @@ from mosaic.views import CompositeOptions, ViewPlan, plan_views
 from pipelines.bridge import CameraPlacement, CameraPose, homography_graph
 from pipelines.config import Config
 from pipelines.decode import Frame
-from pipelines.keyframe_graph import KeyframeImages, KeyframeOptions, KeyframeResult, refine_keyframes
+from pipelines.keyframe_graph import (
+    KeyframeImages,
+    KeyframeOptions,
+    KeyframeResult,
+    refine_keyframes,
+    register_pairs,
+)
 from pipelines.links import without_doubtful
 from pipelines.moving import MovingFinder
+from pipelines.pupil import measured_without, pupil_facts, with_pupil
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
 from pipelines.second_pass import second_pass
@@ -105,19 +113,27 @@ def solve_shot(
     timings = Timings()
     priors, refine_options = tracker.priors, refine_options_of(config)
     with timings.measure("keyframes"):
+        templates = {k: key.template for k, key in tracker.keyframes.items()}
+        options_k = KeyframeOptions(refine=refine_options, register=tracker.register_options)
         result = refine_keyframes(
-            {k: key.template for k, key in tracker.keyframes.items()},
+            templates,
             images,
             [f for f in tracker.fits if f.src in tracker.keyframes and f.dst in tracker.keyframes],
             size_px=tracker.size_px,
             n_levels=n_levels,
             mask=mask,
             priors=priors,
-            options=KeyframeOptions(refine=refine_options, register=tracker.register_options),
+            options=options_k,
         )
         result = _with_central_reference(result, priors)
+        result = with_pupil(
+            result, lambda solved: register_pairs(templates, images, solved, n_levels, mask, options_k)
+        )
         result = _with_known_focal(result, tracker, config, priors)
-        verdict = judge(result.solution, result.graph, GateOptions(refine=result.options))
+        shift = result.pupil.shift_log_f if result.pupil is not None else 0.0
+        verdict = judge(
+            result.solution, result.graph, GateOptions(refine=result.options), pupil_shift_log_f=shift
+        )
         head = level(result.solution)
         if not verdict.sigma_log_f_total < LEVEL_SIGMA:
             # An axis found with a focal that is not known is as wrong as that focal.
@@ -142,12 +158,14 @@ def solve_shot(
     world = head.R_head_world if head.observable else np.eye(3)
     options = CompositeOptions(views=config.panorama.views)
     with timings.measure("plan"):
-        surface, plan = _plan(approximate, tracker, world, config, options)
+        surface, plan = _plan(approximate, tracker, world, config, options, result.parallax)
     store = FrameStore(scratch, tracker.size_px)
     try:
         with timings.measure("second pass"):
             # Only where frames lie relative to each other counts here: the axes of the reference will do.
-            placed = placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px)
+            placed = placements_of(
+                approximate, np.eye(3), tracker.observations, tracker.size_px, result.parallax
+            )
             planned = set(plan.frames)
             fits = second_pass(
                 frames(),
@@ -161,7 +179,9 @@ def solve_shot(
             solution = _poses(tracker, result, [*fits, *_steps(tracker)])
             solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
         with timings.measure("composite"):
-            placements = placements_of(solution, world, tracker.observations, tracker.size_px)
+            placements = placements_of(
+                solution, world, tracker.observations, tracker.size_px, result.parallax
+            )
             panorama = composite(
                 plan, store, placements, surface, options, scratch=scratch,
                 progress=lambda share: progress("composite", round(share * 100), 100),
@@ -207,8 +227,13 @@ def placements_of(
     R_surface_world: NDArray[np.float64],
     observations: Sequence[Observation],
     size_px: tuple[int, int],
+    parallax: Parallax | None = None,
 ) -> list[CameraPlacement]:
-    """Placements of all solved frames, in the panorama's axes; half a frame's motion counts as blur."""
+    """Placements of all solved frames, in the panorama's axes; half a frame's motion counts as blur.
+
+    parallax: of the pupil, in world axes.
+    """
+    turned = None if parallax is None else parallax.of_axes(R_surface_world)
     motion = {o.frame: o.motion_px for o in observations}
     return [
         CameraPlacement(
@@ -217,6 +242,7 @@ def placements_of(
             lens=solution.lens,
             pose=CameraPose(log_f=float(log_f), R=R @ R_surface_world.T),
             blur_px=float(np.nan_to_num(motion.get(int(frame), 0.0), nan=0.0)) * 0.5,
+            parallax=turned,
         )
         for frame, log_f, R in zip(solution.frames, solution.log_f, solution.R, strict=True)
         if np.isfinite(log_f) and int(frame) in motion
@@ -289,6 +315,8 @@ def _poses(tracker: ShotTracker, result: KeyframeResult, fits: Sequence[PairFit]
     between = [f for f in fits if not (f.src in tracker.keyframes and f.dst in tracker.keyframes)]
     graph = homography_graph(frames, between, tracker.size_px)
     solved = solve_poses(graph, held)
+    if result.pupil is not None and result.pupil.accepted:
+        solved = solve_poses(measured_without(graph, solved, result.pupil), held)
     return _with_duplicates(solved, tracker)
 
 
@@ -342,8 +370,9 @@ def _plan(
     world: NDArray[np.float64],
     config: Config,
     options: CompositeOptions,
+    parallax: Parallax | None,
 ) -> tuple[Surface, ViewPlan]:
-    placements = placements_of(solution, world, tracker.observations, tracker.size_px)
+    placements = placements_of(solution, world, tracker.observations, tracker.size_px, parallax)
     stride = max(1, len(placements) // MAX_PLACEMENTS_FOR_SURFACE)
     surface = choose_surface(
         placements[::stride], config.panorama.projection, max_pixels=config.panorama.max_megapixels * 1e6
@@ -412,6 +441,7 @@ def calibration_facts(shot: CalibratedShot, tracker: ShotTracker) -> dict[str, A
             "tilt0_std_deg": float(np.degrees(head.tilt0_std_rad)),
             "rho_std_deg": float(np.degrees(head.rho_std_rad)),
         },
+        "pupil": pupil_facts(shot.keyframes.pupil),
         "keyframes": [int(k) for k in sorted(tracker.keyframes)],
         "keyframe_pairs": len(shot.keyframes.fits),
         "keyframe_pairs_usable": sum(f.usable for f in shot.keyframes.fits),

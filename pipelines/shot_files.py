@@ -166,9 +166,24 @@ def write_panorama(folder: OutputFolder, name: str, shot: CalibratedShot, config
     paths = [folder.stage(n) for n in names]
     write_panorama_tiff(panorama, paths[0], threads=2)
     write_panorama_jpeg(panorama, paths[1], max_width_px=config.output.jpeg_max_width)
-    write_panorama_json(panorama, paths[2], world=world)
+    write_panorama_json(panorama, paths[2], world=world, parallax=_parallax_facts(panorama))
     write_pto(paths[3], panorama.surface, pto_frames(panorama))
     return names
+
+
+def _parallax_facts(panorama: Panorama) -> dict[str, Any] | None:
+    """The pupil's parallax in the axes of the panorama's rays, as panorama.json has it."""
+    placement = next(iter(panorama.placements.values()))
+    parallax = placement.parallax if isinstance(placement, CameraPlacement) else None
+    if parallax is None:
+        return None
+    return {
+        "over_height": parallax.over_height,
+        "over_stand": parallax.over_stand,
+        "R_head_world": parallax.R_head_world.tolist(),
+        "meaning": "a frame with optical axis a sees the ray d at d - max(over_height down, over_stand along) a; "
+        "down and along: the parts of d on the head's y axis (from 0) and across it",
+    }
 
 
 def pto_frames(panorama: Panorama) -> list[PtoFrame]:

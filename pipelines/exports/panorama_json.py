@@ -21,10 +21,13 @@ FORMULAS = {
 RAY = "(X, Y, Z) = (cos lat sin lon, -sin lat, cos lat cos lon); x right, y down, z forward"
 
 
-def panorama_facts(panorama: Panorama, *, world: str) -> dict[str, Any]:
-    """JSON-ready: projection, size_px, scale_px_per_rad, centre_px, formula, world, frames, cover.
+def panorama_facts(
+    panorama: Panorama, *, world: str, parallax: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """JSON-ready: projection, size_px, scale_px_per_rad, centre_px, formula, world, parallax, frames, cover.
 
-    world: what the axes are ('reference camera' or 'levelled: y along the pan axis').
+    world: what the axes are ('reference camera' or 'levelled: y along the pan axis'). parallax: of the pupil, in these
+    axes; None: rays are what every frame sees.
     """
     surface, seen = panorama.surface, panorama.alpha > 0
     counts = panorama.n_seen[seen]
@@ -38,6 +41,7 @@ def panorama_facts(panorama: Panorama, *, world: str) -> dict[str, Any]:
         "formula": FORMULAS[surface.kind],
         "ray": RAY,
         "world": world,
+        "parallax": parallax,
         "frames": [int(k) for k in panorama.frames],
         "gains_rgb": [[round(float(g), 6) for g in row] for row in panorama.gains],
         "cover": float(seen.mean()),
@@ -47,11 +51,15 @@ def panorama_facts(panorama: Panorama, *, world: str) -> dict[str, Any]:
 
 
 def write_panorama_json(
-    panorama: Panorama, path: str | os.PathLike[str], *, world: str = "reference camera"
+    panorama: Panorama,
+    path: str | os.PathLike[str],
+    *,
+    world: str = "reference camera",
+    parallax: dict[str, Any] | None = None,
 ) -> None:
     """Write panorama.json whole or not at all. Raises OSError when the folder cannot be written."""
     with whole_file(path) as temporary:
-        text = json.dumps(panorama_facts(panorama, world=world), indent=1, allow_nan=False)
+        text = json.dumps(panorama_facts(panorama, world=world, parallax=parallax), indent=1, allow_nan=False)
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

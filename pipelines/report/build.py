@@ -32,6 +32,9 @@ CALIBRATION_NOTES = {
     "sigma_log_f_total": "one-sigma error of the focal length, everything included",
     "n_keyframes": "pictures that the camera was solved from",
     "n_edges": "pairs of pictures that were aligned against each other",
+    "over_height": "how far the lens's pupil lies in front of the pan axis, over the axis' height above the pitch",
+    "over_stand": "the same over the distance of the stand",
+    "focal_change": "what taking the pupil's parallax out did to the focal length",
     "support_rows": "rows of the picture that carry the evidence",
 }
 # What the sentence above the verdict's table says already.
@@ -170,7 +173,7 @@ def shot_view(
             (key, text, CALIBRATION_NOTES.get(key.rpartition(".")[2], ""))
             for key, text in flat(
                 {key: value for key, value in shot.calibration.items() if key not in ALREADY_SAID},
-                percent=("sigma_log_f", "sigma_parts", "sigma_mean_log_f", "sigma_relative"),
+                percent=("focal_change", "sigma_log_f", "sigma_parts", "sigma_mean_log_f", "sigma_relative"),
             )
         ],
         "graph": registration_graph(

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib import PupilOptions, fit_pupil, level, refine, rotation
+from calib import PupilOptions, fit_pupil, refine, rotation
+from calib.parallax import Parallax
 from calib.problem import pack
 from calib.pupil import parallax_px
 from tests.calib import tracks
@@ -31,8 +32,9 @@ def broadcast(seed):
 def test_the_displacement_is_that_of_a_scene_built_point_by_point():
     truth, graph = broadcast(0)
     solution = replace(refine(graph), log_f=truth.log_f, R=truth.R, lens=truth.lens)
-    head = replace(level(solution), R_head_world=rotation.from_pan_tilt_roll(0.0, TILT0, 0.0).T)
-    shift = parallax_px(pack(graph), solution, head, np.array([OVER_HEIGHT, OVER_STAND]))
+    R_head_world = rotation.from_pan_tilt_roll(0.0, TILT0, 0.0).T
+    scene = Parallax(over_height=OVER_HEIGHT, over_stand=OVER_STAND, R_head_world=R_head_world)
+    shift = parallax_px(pack(graph), solution, scene)
     rows = {f: k for k, f in enumerate(truth.frames.tolist())}
     largest = 0.0
     for k, e in enumerate(graph.edges):

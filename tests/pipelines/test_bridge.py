@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from calib import rotation
+from calib.parallax import Parallax
 from calib.records import Lens
 from pipelines.bridge import CameraPlacement, CameraPose, PairState, RotationZoomFamily, pair_state
 
@@ -26,6 +27,20 @@ def test_points_equal_the_cameras_placements():
     rays = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=src).pixel_to_ray(POINTS)
     expected = CameraPlacement(frame=1, size_px=SIZE, lens=lens, pose=dst).ray_to_pixel(rays)
     np.testing.assert_allclose(where, expected, atol=1e-7)
+
+
+def test_a_placement_with_parallax_sees_near_and_far_apart_and_is_its_own_inverse():
+    lens, src, _, _, _ = family_and_state()
+    parallax = Parallax(over_height=0.04, over_stand=0.006, R_head_world=np.eye(3))
+    turned = CameraPose(log_f=src.log_f, R=rotation.from_pan_tilt_roll(0.2, -0.1, 0.0))
+    plain = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=turned)
+    moved = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=turned, parallax=parallax)
+    rays = moved.pixel_to_ray(POINTS)
+    np.testing.assert_allclose(moved.ray_to_pixel(rays), POINTS, atol=1e-7)
+    # The pupil is nearer than the axis: the scene spreads from the optical axis, the near pitch more than the stand.
+    spread = np.linalg.norm(moved.ray_to_pixel(plain.pixel_to_ray(POINTS)) - POINTS, axis=1)
+    near = POINTS[:, 1] > 1000
+    assert spread[near].min() > 1.0 and spread[near].mean() > 1.5 * spread[POINTS[:, 1] < 300].mean()
 
 
 @pytest.mark.parametrize("parameter", range(4))

@@ -99,6 +99,8 @@ def test_run_json_is_whole(pan_run: Finished) -> None:
     assert set(shot["files"]) <= OUTPUTS
     assert shot["focal"]["min_px"] < shot["focal"]["max_px"]
     assert shot["calibration"]["sigma_relative"] <= 0.1
+    pupil = shot["calibration"]["pupil"]  # this camera turns about its pupil
+    assert not pupil["accepted"] and pupil["reason"] == "not_significant" and pupil["R_head_world"] is None
     assert record["complete"] is True
     assert read_run(pan_run.out).shots[0].reference_frame == shot["reference_frame"]
 

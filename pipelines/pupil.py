@@ -1,0 +1,85 @@
+"""The parallax of the entrance pupil in a shot: estimated from its keyframes, taken out of what frames measured.
+
+Keyframes are registered again with the lens that is left when the parallax is out, because a pair measures a little
+of the lens that it was registered through. What the parallax is and how it is found: `calib.parallax`, `calib.pupil`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from calib.pupil import PupilFit, PupilOptions, fit_pupil, without_parallax
+from calib.records import HomographyGraph, Solution
+from calib.refine import refine
+from mosaic.records import PairFit
+from pipelines.bridge import homography_graph
+from pipelines.keyframe_graph import KeyframeResult
+
+log = logging.getLogger(__name__)
+
+MAX_ROUNDS = 4  # of registering the keyframes again; half of what is left goes per round
+SETTLED = 0.001  # change of mean log f at which they stop
+
+
+def with_pupil(result: KeyframeResult, register: Callable[[Solution], list[PairFit]]) -> KeyframeResult:
+    """The keyframes without the pupil's parallax, where they show one; else as they are, with the reason in `pupil`.
+
+    register: the keyframe pairs anew, through a solution's lens. The result's graph is the corrected one.
+    """
+    if not (result.options.distortion and np.isfinite(result.solution.log_f).sum() >= 2):
+        return result  # the plain model of a torn graph claims nothing, so there is nothing to correct
+    found = _fit(result.graph, result.solution, result)
+    result = replace(result, pupil=found)
+    for _ in range(MAX_ROUNDS):
+        if not found.accepted:
+            break
+        result = replace(result, solution=found.solution, graph=found.graph, pupil=found)
+        fits = register(found.solution)
+        graph = homography_graph(found.solution.frames, fits, result.graph.size_px)
+        options = replace(result.options, reference=found.solution.reference)
+        solution = refine(graph, start=found.solution, priors=found.solution.priors, options=options)
+        if not np.isfinite(solution.log_f).all():
+            break
+        before, found = found, _fit(graph, solution, result)
+        if not found.accepted:
+            break
+        change = float(np.mean(found.solution.log_f - before.solution.log_f))
+        log.debug("pupil: mean log f moved by %.4f, by another registration %.4f", found.shift_log_f, change)
+        result = replace(result, solution=found.solution, graph=found.graph, fits=tuple(fits), pupil=found)
+        if abs(change) < SETTLED:
+            break
+    return result
+
+
+def _fit(graph: HomographyGraph, solution: Solution, result: KeyframeResult) -> PupilFit:
+    return fit_pupil(graph, solution, PupilOptions(refine=result.options))
+
+
+def measured_without(graph: HomographyGraph, solution: Solution, pupil: PupilFit | None) -> HomographyGraph:
+    """A graph's measurements without the parallax of an accepted pupil; solution: cameras of its frames."""
+    if pupil is None or pupil.parallax is None:
+        return graph
+    return without_parallax(graph, solution, pupil.parallax)
+
+
+def pupil_facts(pupil: PupilFit | None) -> dict[str, Any] | None:
+    """What run.json says of the pupil; None where the shot was too little calibrated to look for one."""
+    if pupil is None:
+        return None
+    parallax = pupil.parallax
+    return {
+        "accepted": pupil.accepted,
+        "reason": pupil.reason,
+        "sentence": pupil.sentence,
+        "over_height": pupil.over_height,
+        "over_height_std": pupil.over_height_std,
+        "over_stand": pupil.over_stand,
+        "over_stand_std": pupil.over_stand_std,
+        "focal_change": float(np.expm1(pupil.shift_log_f)),
+        "R_head_world": None if parallax is None else parallax.R_head_world.tolist(),
+    }
