@@ -62,7 +62,8 @@ def align(
         n_steps += steps
         if not np.isfinite(fine.scale):
             return _failed(template.frame, dst, template.size_px, "diverged", route, n_steps), start
-    return _judge(pair, state, fine, n_steps, dst, route, options), state
+    state, steps, fine = _polish(pair, state, fine, options)
+    return _judge(pair, state, fine, n_steps + steps, dst, route, options), state
 
 
 def _gain(pair: LevelPair, state: Any) -> tuple[float, float]:
@@ -110,6 +111,40 @@ def _align_level(
         if small:
             break
     return state, steps, now
+
+
+# The scale is this much too large before the finest level is done again with a smaller one.
+_OUTLIERS = 1.15
+
+
+def _polish(
+    pair: LevelPair, state: Any, fine: Linearised, options: RegisterOptions
+) -> tuple[Any, int, Linearised]:
+    """Steps at the scale of the pixels that agree, held fixed, as long as Tukey's cost falls.
+
+    Players, crowd and whatever else moves widen the robust scale, and with it they keep a pull on the alignment: the
+    scale that is right to find it is too wide to finish it (an MM-estimator: Yohai 1987).
+    """
+    kernel = pair.kernel
+    fine.sigma = kernel.inlier_scale(fine.residual, fine.scale)
+    steps = 0
+    while steps < options.polish_steps and fine.sigma * _OUTLIERS < fine.scale:
+        weight = kernel.robust_weights(fine.residual, np.float32(fine.sigma), True)
+        N, b, _ = kernel.accumulate(fine.residual, fine.G, fine.J, weight)
+        step = newton_step(N, b, 0.0)
+        if step is None:
+            break
+        trial_state = pair.source.family.update(state, step)
+        trial = pair.evaluate(trial_state)
+        steps += 1
+        before, after = (kernel.tukey_cost(x.residual, fine.sigma) for x in (fine, trial))
+        if trial.n_valid < options.min_pixels or not after < before:
+            break
+        trial.sigma = fine.sigma
+        state, fine = trial_state, trial
+        if step_in_sigmas(N, step, fine.sigma**2) < options.stop_sigmas:
+            break
+    return state, steps, fine
 
 
 def _judge(

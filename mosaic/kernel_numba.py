@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from mosaic.photometric import NORMAL_QUANTILE, SCALE_QUANTILE
+from mosaic.photometric import NORMAL_QUANTILE, SCALE_QUANTILE, TUKEY, TUKEY_VARIANCE
 
 _jit = nb.njit(cache=True, nogil=True, fastmath=False, boundscheck=False)
 _ONE, _TWO = np.uint64(1), np.uint64(2)
@@ -166,7 +166,7 @@ def robust_weights(residual, scale, tukey):  # type: ignore[no-untyped-def]
     """Tukey (4.685 scale) or Huber (1.345 scale) weights; 0 where the residual is NaN."""
     n = residual.shape[0]
     weight = np.zeros(n, np.float32)
-    c = 4.685 * scale if tukey else 1.345 * scale
+    c = TUKEY * scale if tukey else 1.345 * scale
     for i in range(n):
         r = abs(residual[i])
         if not np.isfinite(r):
@@ -293,6 +293,44 @@ def robust_scale(residual):  # type: ignore[no-untyped-def]
             few[m] = absolute[i]
             m += 1
     return max(float(np.sort(few)[k]) / NORMAL_QUANTILE, 0.5), n
+
+
+@_jit
+def inlier_scale(residual, scale):  # type: ignore[no-untyped-def]
+    """Standard deviation of the pixels that agree, from the robust scale (too large by those that do not).
+
+    Fixed point of the Tukey-weighted variance, from above: what disagrees loses its weight step by step. At least .5.
+    """
+    for _ in range(8):
+        c2 = 1.0 / (TUKEY * TUKEY * scale * scale)
+        total = 0.0
+        squares = 0.0
+        for i in range(len(residual)):
+            r2 = np.float64(residual[i]) * np.float64(residual[i])
+            u = r2 * c2
+            if u < 1.0:  # false for NaN
+                w = (1.0 - u) * (1.0 - u)
+                total += w
+                squares += w * r2
+        if not total > 0.0:
+            break
+        smaller = max(np.sqrt(squares / total / TUKEY_VARIANCE), 0.5)
+        done = smaller > 0.98 * scale
+        scale = min(smaller, scale)
+        if done:
+            break
+    return scale
+
+
+@_jit
+def tukey_cost(residual, scale):  # type: ignore[no-untyped-def]
+    """Tukey's cost over the pixels, 0 (all agree) to 1; a pixel that is not seen costs 1."""
+    total = 0.0
+    for i in range(len(residual)):
+        u = np.float64(residual[i]) / (TUKEY * scale)
+        u *= u
+        total += 1.0 - (1.0 - u) ** 3 if u < 1.0 else 1.0
+    return total / max(len(residual), 1)
 
 
 @_jit

@@ -13,7 +13,7 @@ from kornia.filters import spatial_gradient
 from numpy.typing import NDArray
 from torch.nn.functional import grid_sample
 
-from mosaic.photometric import NORMAL_QUANTILE, SCALE_QUANTILE
+from mosaic.photometric import NORMAL_QUANTILE, SCALE_QUANTILE, TUKEY, TUKEY_VARIANCE
 
 FloatArray = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def linearise(
 def robust_weights(residual: NDArray[np.float32], scale: float, tukey: bool) -> NDArray[np.float32]:
     """See kernel_numba.robust_weights."""
     r = torch.from_numpy(residual).abs()
-    c = (4.685 if tukey else 1.345) * float(scale)
+    c = (TUKEY if tukey else 1.345) * float(scale)
     weight = (1.0 - (r / c) ** 2).clamp(min=0.0) ** 2 if tukey else torch.where(r <= c, 1.0, c / r)
     return torch.nan_to_num(weight, nan=0.0).numpy().astype(np.float32)
 
@@ -161,6 +161,27 @@ def robust_scale(residual: NDArray[np.float32]) -> tuple[float, int]:
         return float("nan"), 0
     quantile = torch.kthvalue(r, int(SCALE_QUANTILE * len(r)) + 1).values
     return max(float(quantile) / NORMAL_QUANTILE, 0.5), len(r)
+
+
+def inlier_scale(residual: NDArray[np.float32], scale: float) -> float:
+    """See kernel_numba.inlier_scale."""
+    r2 = torch.from_numpy(residual[np.isfinite(residual)]).double() ** 2
+    for _ in range(8):
+        w = (1.0 - r2 / (TUKEY * scale) ** 2).clamp(min=0.0) ** 2
+        if not float(w.sum()) > 0.0:
+            break
+        smaller = max(float(((w * r2).sum() / w.sum() / TUKEY_VARIANCE).sqrt()), 0.5)
+        done = smaller > 0.98 * scale
+        scale = min(smaller, scale)
+        if done:
+            break
+    return scale
+
+
+def tukey_cost(residual: NDArray[np.float32], scale: float) -> float:
+    """See kernel_numba.tukey_cost."""
+    u = torch.nan_to_num(torch.from_numpy(residual).double() / (TUKEY * scale), nan=1.0).abs().clamp(max=1.0)
+    return float((1.0 - (1.0 - u**2) ** 3).mean())
 
 
 def shifted_residuals(

@@ -20,7 +20,8 @@ class RegisterOptions:
 
     max_steps: Gauss-Newton steps per level from the finest on. stop_sigmas: a level ends when a step is below this
     share of its own standard deviation (the next one would be far smaller); stop_sigmas_coarse: of coarse levels, which
-    only hand on. min_overlap, min_inliers: shares of informative pixels. score_ok, score_weak: largest residual scale
+    only hand on. polish_steps: more on the finest level, where the scale is larger than that of the pixels that agree.
+    min_overlap, min_inliers: shares of informative pixels. score_ok, score_weak: largest residual scale
     against that of shifted pictures. cell_floor_px: error of a cell's place that is not noise (crowd, codec;
     real-footage.md 6.3). cell_max_px: directions less certain are dropped. cell_linear_px: residual flow beyond which
     it is no measurement, found in flow_passes local steps. correlation: variance inflation of a cell, whose residuals
@@ -30,6 +31,7 @@ class RegisterOptions:
     max_steps: tuple[int, ...] = (4, 5, 6, 8, 10, 10)
     stop_sigmas: float = 0.3
     stop_sigmas_coarse: float = 1.0
+    polish_steps: int = 4
     min_pixels: int = 60
     min_overlap: float = 0.2
     min_inliers: float = 0.25
@@ -47,7 +49,8 @@ class RegisterOptions:
 class Linearised:
     """A level at a state: dst (n, 2) px, J (n, 2, p), A (n, 2, 2), residual (n,) grey, G (n, 2) grey per px.
 
-    scale: robust deviation of the residuals, NaN without any; n_valid of them are finite.
+    scale: robust deviation of the residuals, NaN without any; n_valid of them are finite. sigma: deviation of those
+    that agree, smaller where many do not; the scale itself until it is asked for.
     """
 
     dst: FloatArray
@@ -57,6 +60,7 @@ class Linearised:
     G: NDArray[np.float32]
     scale: float
     n_valid: int
+    sigma: float
 
 
 @dataclass(slots=True, eq=False)
@@ -91,4 +95,6 @@ class LevelPair:
             *self.picture, where, A, level.values, level.gradients, self.gain, self.offset, *self.masks
         )
         scale, n_valid = self.kernel.robust_scale(residual)
-        return Linearised(dst=where, J=J, A=A, residual=residual, G=G, scale=scale, n_valid=n_valid)
+        return Linearised(
+            dst=where, J=J, A=A, residual=residual, G=G, scale=scale, n_valid=n_valid, sigma=scale
+        )

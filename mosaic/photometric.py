@@ -14,6 +14,8 @@ import numpy as np
 # gradients where the pitch shows none, and up to two thirds of the chosen pixels may move on their own.
 SCALE_QUANTILE = 0.3
 NORMAL_QUANTILE = 0.38532  # of |x|, x standard normal
+TUKEY = 4.685  # width of the weights in deviations: 95 % efficiency on normal residuals
+TUKEY_VARIANCE = 0.82807  # weighted variance of standard normal residuals under them
 
 
 @nb.njit(cache=True, nogil=True)

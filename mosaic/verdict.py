@@ -34,7 +34,7 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
     cannot tell them apart. Zeros where the pixels do not determine the anchors.
     """
     level, kernel = pair.pixels, pair.kernel
-    weight = kernel.robust_weights(fine.residual, np.float32(fine.scale), True)
+    weight = kernel.robust_weights(fine.residual, np.float32(fine.sigma), True)
     N, _, _ = kernel.accumulate(fine.residual, fine.G, fine.J, weight)
     scores = kernel.cell_scores(fine.residual, fine.G, fine.J, weight, level.cell, N_CELLS)
     p = len(N)
@@ -47,6 +47,6 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
     # 2 n equations of p parameters: the sums at the optimum are smaller than the errors by that share.
     share = 2 * n_cells / (2 * n_cells - p)
     kappa = share * float(np.einsum("ca,ca->", scores, np.linalg.solve(N, scores.T).T)) / p
-    variance = max(kappa, fine.scale**2)
+    variance = max(kappa, fine.sigma**2)
     back = np.linalg.inv(J8)
     return back.T @ (N / variance) @ back

@@ -98,9 +98,25 @@ def test_kernels_agree_on_what_is_measured_after_the_alignment(pair):
         null = kernel.shifted_residuals(
             *picture, where, np.array([[5.0, 2.0], [-40.0, 3.0]]), 3, level.values, 1.1, -3.0, *masks
         )
-        found.append((scale, step, spread, scores, np.nan_to_num(null)))
+        inner = kernel.inlier_scale(r, scale)
+        assert 0.5 <= inner <= scale
+        cost = kernel.tukey_cost(r, inner)
+        assert 0 < kernel.tukey_cost(r, 2 * inner) < cost < 1
+        found.append((scale, inner, cost, step, spread, scores, np.nan_to_num(null)))
     for a, b in zip(*found, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-3)
+
+
+def test_the_inlier_scale_leaves_out_what_the_robust_scale_swallows():
+    """60 % of the residuals are noise of 2 levels, 40 % anything up to 60: 3 levels by the quantile, 2.3 at last."""
+    rng = np.random.default_rng(0)
+    r = np.concatenate([rng.normal(0, 2, 6000), rng.uniform(-60, 60, 4000)]).astype(np.float32)
+    for kernel in (kernel_numba, kernel_torch):
+        scale, _ = kernel.robust_scale(r)
+        assert scale > 3
+        assert kernel.inlier_scale(r, scale) == pytest.approx(2.0, rel=0.2)
+        alone = kernel.inlier_scale(r[:6000], kernel.robust_scale(r[:6000])[0])
+        assert alone == pytest.approx(2.0, rel=0.03)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 1000])

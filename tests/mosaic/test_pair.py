@@ -12,6 +12,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mosaic.coords import transfer
 from mosaic.pair import REASONS, PairOptions, register
 from mosaic.records import PairStatus
 from tests.mosaic.textures import (
@@ -74,17 +75,17 @@ def test_exposure_does_not_move_the_homography(gain, offset):
     assert corner_error_px(changed.H_dst_src, plain.H_dst_src) < 0.05
 
 
-def test_the_error_agrees_with_the_stated_information():
-    """Mean of d^T info d over pairs against its 8 degrees of freedom: the errors stated must not be too small."""
+@pytest.mark.parametrize(("noise", "moving"), [(1.0, 0.0), (5.0, 0.0), (3.0, 0.1)])
+def test_the_error_agrees_with_the_stated_information(noise, moving):
+    """Mean of d^T info d over pairs against its 8 degrees of freedom, within a factor of 2, also where things move."""
     H = homography(4, 3, 1.02, 0.5, 0.01, 0.01)
     total = []
-    for seed in range(10):
-        fit = register(as_uint8(picture(seed), noise=3, seed=1), as_uint8(picture(seed, H), noise=3, seed=2))
-        p = fit.anchors_px @ H[:, :2].T + H[:, 2]
-        q = fit.anchors_px @ fit.H_dst_src[:, :2].T + fit.H_dst_src[:, 2]
-        d = (q[:, :2] / q[:, 2:] - p[:, :2] / p[:, 2:]).ravel()
+    for seed in range(12):
+        a, b = (blocks(p, moving, seed + k) for k, p in ((100, picture(seed)), (200, picture(seed, H))))
+        fit = register(as_uint8(a, noise=noise, seed=1), as_uint8(b, noise=noise, seed=2))
+        d = (transfer(fit.H_dst_src, fit.anchors_px) - transfer(H, fit.anchors_px)).ravel()
         total.append(d @ fit.info @ d / 8)
-    assert np.mean(total) < 1.5
+    assert 0.5 < np.mean(total) < 2.0
 
 
 @pytest.mark.parametrize("seed", range(6))
