@@ -70,10 +70,13 @@ def _linear(flat, stride, xi, yi, s, t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def sample_view(image, trust, still, grid, step, gain, margin, feather, cubic, out, out_vote, out_weight):  # type: ignore[no-untyped-def]
+def sample_view(  # type: ignore[no-untyped-def]
+    image, top, height, trust, still, grid, step, gain, margin, feather, cubic, out, out_vote, out_weight
+):
     """Sample one frame over one tile.
 
-    image (H, W, 3) uint8. trust and still: uint8 planes over the same frame at any resolution, 255 = the scene at
+    image (H, W, 3) uint8: the rows from `top` on of a frame `height` px high, all that the grid can reach. trust and
+    still: uint8 planes over the same frame at any resolution, 255 = the scene at
     rest, nearest pixel taken; a (1, 1) plane holds for the whole frame. grid (rows, columns, 4) float32: frame x, y,
     vote and weight 0..1 at every `step`-th tile pixel, linear in between. gain (3,) multiplies the channels. A sample
     nearer than `margin` px to the frame's border, or of trust, still or vote 0, is not seen; from there vote and weight
@@ -81,7 +84,7 @@ def sample_view(image, trust, still, grid, step, gain, margin, feather, cubic, o
     Out, uint8: out (3, h, w); out_vote (h, w), 0 = not seen, else at least 1; out_weight (h, w), likewise.
     Catmull-Rom (cubic) or linear, with float weights (cv2.remap rounds positions to 1/32 px).
     """
-    height, width = image.shape[0], image.shape[1]
+    width = image.shape[1]
     rows, columns = out_vote.shape
     flat, stride = image.reshape(-1), 3 * width
     x_last, y_last = width - 1 - margin, height - 1 - margin
@@ -133,9 +136,9 @@ def sample_view(image, trust, still, grid, step, gain, margin, feather, cubic, o
                 ramp *= np.float32(sure) * np.float32(rest) * (one / (full * full))
                 s, t = x - np.float32(xi), y - np.float32(yi)
                 if cubic:
-                    r, g, b = _cubic(flat, stride, xi, yi, s, t)
+                    r, g, b = _cubic(flat, stride, xi, yi - top, s, t)
                 else:
-                    r, g, b = _linear(flat, stride, xi, yi, s, t)
+                    r, g, b = _linear(flat, stride, xi, yi - top, s, t)
                 out[0, row, column] = np.uint8(min(max(r * gain_r + rounding, zero), full))
                 out[1, row, column] = np.uint8(min(max(g * gain_g + rounding, zero), full))
                 out[2, row, column] = np.uint8(min(max(b * gain_b + rounding, zero), full))

@@ -21,7 +21,8 @@ from mosaic.canvas import Canvas
 from mosaic.framestore import COARSE, FrameStore
 from mosaic.moving import find_still
 from mosaic.surface import Placement, Surface
-from mosaic.tiles import Scene, paint
+from mosaic.tile_maps import Scene
+from mosaic.tiles import paint
 from mosaic.views import CompositeOptions, Lattice, ViewPlan, lattice_of, plan_views, rate_views, share_views
 
 __all__ = ["Canvas", "CompositeOptions", "FrameStore", "Panorama", "ViewPlan", "composite", "plan_views"]
@@ -103,7 +104,8 @@ def composite(
         still=tuple(store.still(p.frame) for p in views),
     )  # fmt: skip
     if options.motion_rounds > 0:
-        scene = replace(scene, still=find_still(scene))
+        still, quiet = find_still(scene)
+        scene = replace(scene, still=still, quiet=quiet)
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     layers = paint(scene, canvas, progress)
     alpha = canvas.zeros(layers.n_seen.shape)

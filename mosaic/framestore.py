@@ -201,6 +201,10 @@ class FrameStore:
 
     def _read(self, offset: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         array = self._buffer(shape)
+        self._fill(array, offset)
+        return array
+
+    def _fill(self, array: NDArray[np.uint8], offset: int) -> None:
         view = array.data.cast("B")
         while view:
             n_bytes = os.preadv(self._file, [view], offset)
@@ -208,7 +212,6 @@ class FrameStore:
                 raise OSError(f"scratch file {self._path} ends at byte {offset}: it was cut while in use")
             offset += n_bytes
             view = view[n_bytes:]
-        return array
 
     def get(self, frame: int, shrink: int = 1) -> StoredFrame:
         """The frame, or its mean over blocks of shrink x shrink px. Raises KeyError for a frame not stored."""
@@ -232,6 +235,19 @@ class FrameStore:
                 self._loading.pop(key).set()
         return stored
 
+    def rows(self, frame: int, first: int, last: int, buffer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Rows first to last - 1 of a frame's picture, (last - first, w, 3), in `buffer`, a flat one of a frame's size
+        or more. Past the cache: who needs a part of many frames would only fill it. Raises KeyError for a frame not
+        stored."""
+        stride = 3 * self.size_px[0]
+        part = buffer[: (last - first) * stride]
+        self._fill(part, self._offset[frame] + first * stride)
+        return part.reshape(last - first, self.size_px[0], 3)
+
+    def trust(self, frame: int) -> NDArray[np.uint8] | None:
+        """The frame's trust plane (h, w) uint8 at full size, None = 255 all over."""
+        return self._read_trust(frame)
+
     def _load(self, frame: int, shrink: int) -> StoredFrame:
         width, height = self.size_px
         rgb = self._read(self._offset[frame], (height, width, 3))
@@ -239,7 +255,11 @@ class FrameStore:
         if shrink > 1:
             small = (width // shrink, height // shrink)
             cut = np.s_[: small[1] * shrink, : small[0] * shrink]
-            rgb = np.asarray(cv2.resize(rgb[cut], small, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            whole = rgb
+            rgb = np.asarray(cv2.resize(whole[cut], small, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            with self._lock:
+                if len(self._spare) < 2:
+                    self._spare.append(whole)
             if trust is not None:
                 trust = block_minimum(trust[cut], shrink)
         return StoredFrame(rgb=rgb, trust=trust, shrink=shrink)

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from mosaic.canvas import Canvas
 from mosaic.motion import expand_map, local_contrast
 from mosaic.surface import Placement, Surface
-from mosaic.tiles import Layers, Scene, paint
-from mosaic.views import Lattice
+from mosaic.tile_maps import GRID_PX, Scene
+from mosaic.tiles import Layers, paint
+from mosaic.views import CompositeOptions, Lattice
 
 SMALL_WIDTH_PX = 320  # frames are compared at about this width
 DISTRUSTED = 2  # of 255: what seems to move still counts where nothing else is there
@@ -44,13 +45,18 @@ GROUND_PX, GROUND_SHRINK = (
 PLAIN_GREY = 16.0  # usual distance from the ground round about, above which that is no plain ground
 HALO, LIFTED = 8, 150  # trust close round what moves; and there where the colour is that of the plain ground
 MOMENT_FRAMES = 6  # views nearer than this say the same about a place
+AGREE = 0.8 * 255  # support from which views are taken to agree
 STEP_PX = 16  # spacing of exact map points in the small frame
 
 
-def find_still(scene: Scene) -> tuple[NDArray[np.uint8], ...]:
-    """A plane (h / m, w / m) uint8 per view, m about w / 320: 255 at rest, DISTRUSTED where something moves.
+def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.uint8]]:
+    """A plane (h / m, w / m) uint8 per view, m about w / 320: 255 at rest, DISTRUSTED where something moves. And a
+    plane over the surface at the same scale: 1 where all views agree.
 
-    scene.still, when given, is where the rounds start, and what is low there stays low."""
+    scene.still, when given, is where the rounds start, and what is low there stays low. Raises ValueError for no
+    round."""
+    if scene.options.motion_rounds < 1:
+        raise ValueError(f"{scene.options.motion_rounds} rounds find nothing")
     width = scene.views[0].size_px[0]
     shrink = max(1, round(width / SMALL_WIDTH_PX))
     small = _small_scene(scene, shrink)
@@ -78,7 +84,21 @@ def find_still(scene: Scene) -> tuple[NDArray[np.uint8], ...]:
 
             still = tuple(pool.map(judge, range(len(scene.views))))
     assert still is not None
-    return still
+    return still, _quiet(layers, scene.options, shrink)
+
+
+def _quiet(layers: Layers, options: CompositeOptions, shrink: int) -> NDArray[np.uint8]:
+    """1 where enough views see the same and few of them something else, and so for half a cell of the full tiles' maps
+    round about: the nearest grid point stands for the pixels between."""
+    agree = (
+        (layers.spread <= 2 * options.doubt)
+        & (layers.support >= AGREE)
+        & (layers.n_seen >= options.quiet_views)
+    )
+    side = 2 * -(-GRID_PX // (2 * shrink)) + 1
+    return np.asarray(
+        cv2.erode(agree.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=1), np.uint8
+    )
 
 
 def _small_scene(scene: Scene, shrink: int) -> Scene:
@@ -94,7 +114,7 @@ def _small_scene(scene: Scene, shrink: int) -> Scene:
     # Painted in every round: the maps are kept, and need not be finer than the comparison.
     return replace(
         scene, surface=surface, lattice=lattice, options=replace(scene.options, tile_px=256, cubic=False),
-        map_error_px=0.1 * shrink, maps={},
+        map_error_px=0.1 * shrink, maps={}, fillers={},
     )  # fmt: skip
 
 

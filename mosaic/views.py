@@ -34,6 +34,8 @@ class CompositeOptions:
     threads: tiles worked on at once. memory_bytes: an image larger than this lives in a file in the scratch folder.
     gains: level the exposure of the views. motion_rounds: rounds of looking
     for what moves (moving.py): each lifts slow players a little more, 3 reach what 6 do within .3 dB; 0 = none.
+    quiet_views: views sampled where all agree about what they show (moving.py): 7 to 25 differ by .05 dB there, and
+    half of the time goes into sampling.
     max_candidates: frames looked at when planning; a longer clip is thinned, the least blurred of each group stays.
     """
 
@@ -55,6 +57,7 @@ class CompositeOptions:
     max_candidates: int = 1200
     gains: bool = True
     motion_rounds: int = 3
+    quiet_views: int = 9
 
     def __post_init__(self) -> None:
         if not 1 <= self.views <= self.max_views <= 255:

@@ -23,7 +23,7 @@ def sampled(
     everywhere = np.full((1, 1), 255, np.uint8)
     trust, still = (everywhere if plane is None else plane for plane in (trust, still))
     sample_view(
-        image, trust, still, grid, step, np.array(gain, np.float32), np.float32(margin),
+        image, 0, image.shape[0], trust, still, grid, step, np.array(gain, np.float32), np.float32(margin),
         np.float32(feather), cubic, out, seen, weight,
     )  # fmt: skip
     return out, seen, weight

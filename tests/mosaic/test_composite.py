@@ -84,6 +84,26 @@ def test_players_leave_no_trace(tmp_path):
     assert np.quantile(error, 0.999) < 12 and (error > 40).sum() == 0
 
 
+def test_where_all_views_agree_few_are_sampled_and_nothing_else_changes(tmp_path):
+    frames = sweep((-3, 3), n=30, f_px=400.0, size_px=(320, 180))
+    surface = choose_surface(frames, "planar")
+    pictures = []
+    for p in frames:
+        rgb = picture(p, noise=2.0)
+        x, y = np.rint(p.ray_to_pixel(np.array([-0.3 + 0.02 * p.frame, 0.0, 1.0]))).astype(int)
+        rgb[y - 12 : y + 12, max(x - 6, 0) : max(x + 6, 0)] = 255
+        pictures.append(rgb)
+    few = composite_of(tmp_path, frames, surface, pictures, quiet_views=5)
+    full = composite_of(tmp_path, frames, surface, pictures, quiet_views=200)  # no place has so many
+    looked_into = full.n_seen >= 15
+    assert np.median(full.n_seen[looked_into]) > 2.5 * np.median(few.n_seen[looked_into])
+    truth = clean_plate(surface)
+    assert psnr(few.image, truth, looked_into) > 40
+    error = np.abs(few.image - truth).max(axis=-1)
+    assert (error[looked_into] > 40).sum() == 0
+    assert ((few.n_seen > 0) == (full.n_seen > 0)).all()
+
+
 def test_a_standing_player_is_removed_where_trust_says_so(tmp_path):
     frames = sweep((-1, 1), n=15, f_px=400.0, size_px=(240, 136))
     surface = choose_surface(frames, "planar")
@@ -293,6 +313,8 @@ def test_store_gives_back_what_it_was_given_and_keeps_its_budget(tmp_path):
         assert ((store.get(10).trust == 0) >= ~mask).all() and (store.get(10).trust == 0).sum() > 5 * (
             ~mask
         ).sum()
+        part = store.rows(10, 20, 41, np.empty(96 * 64 * 3, np.uint8))
+        assert (part == store.get(10).rgb[20:41]).all()
         half = store.get(0, shrink=2)
         mean = pictures[0].reshape(32, 2, 48, 2, 3).mean(axis=(1, 3))
         assert half.shrink == 2 and np.abs(half.rgb - mean).max() <= 0.5
