@@ -1,4 +1,4 @@
-"""The surface a panorama is painted on (sphere, cylinder or plane) and its map between pixels and rays.
+"""The surface a panorama is painted on (sphere, cylinder, plane, Pannini's) and its map between pixels and rays.
 
 Rays are directions in the shot world: x right, y down, z forward. Pixel (0, 0) is the centre of the top-left
 pixel. With ray = (cos lat sin lon, -sin lat, cos lat cos lon):
@@ -6,6 +6,10 @@ pixel. With ray = (cos lat sin lon, -sin lat, cos lat cos lon):
     equirectangular  x = cx + s lon,   y = cy - s lat
     cylindrical      x = cx + s lon,   y = cy - s tan lat
     planar           x = cx + s X/Z,   y = cy + s Y/Z
+    pannini          x = cx + s q sin lon,  y = cy - s q tan lat,  q = 2 / (1 + cos lon)
+
+Pannini's is a cylinder seen from the opposite side of its axis: upright lines and lines through the middle stay
+straight as on a plane, the others bend less than on a cylinder; at 50 degrees it stretches 1.2 times, a plane 2.4.
 
 It does not know how a frame sees a ray: that is a Placement, made by whoever knows the camera.
 """
@@ -19,18 +23,19 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-SurfaceKind = Literal["equirectangular", "cylindrical", "planar"]
-KINDS: tuple[SurfaceKind, ...] = ("equirectangular", "cylindrical", "planar")
+SurfaceKind = Literal["equirectangular", "cylindrical", "planar", "pannini"]
+KINDS: tuple[SurfaceKind, ...] = ("equirectangular", "cylindrical", "planar", "pannini")
 
 # A plane stretches by 1/cos^2 of the angle to its centre: 1.5 times at 35 degrees. Up to about 50 degrees in all
 # that is not noticed and straight lines stay straight; a cylinder stretches by 1/cos^2 of the latitude only.
 PLANAR_TOTAL_RAD = np.radians(50.0)
 PLANAR_SIDE_RAD = np.radians(35.0)
-CYLINDER_PAN_RAD = np.radians(100.0)
-CYLINDER_TILT_RAD = np.radians(60.0)
-CYLINDER_SIDE_RAD = np.radians(45.0)
+PANNINI_PAN_RAD = np.radians(100.0)
+PANNINI_TILT_RAD = np.radians(60.0)
+PANNINI_SIDE_RAD = np.radians(45.0)
 # Asked for explicitly, plane and cylinder are cut where they would stretch to infinity (1/cos^2 = 15).
 CUT_RAD = np.radians(75.0)
+PANNINI_CUT_RAD = np.radians(150.0)  # where it is stretched 15 times
 
 
 class Placement(Protocol):
@@ -77,8 +82,9 @@ class Surface:
 
     @property
     def centre_lon_rad(self) -> float:
-        """Longitude of the crop's middle: longitudes are taken within half a turn of it (0 on a plane)."""
-        return 0.0 if self.kind == "planar" else ((self.width - 1) / 2 - self.cx) / self.scale_px
+        """Longitude of the crop's middle: longitudes are taken within half a turn of it (0 on a plane, and on Pannini's
+        surface, which ends half a turn from the forward axis)."""
+        return 0.0 if self.kind in ("planar", "pannini") else ((self.width - 1) / 2 - self.cx) / self.scale_px
 
     def pixel_to_ray(self, xy: ArrayLike) -> NDArray[np.float64]:
         """Panorama pixels (..., 2) -> unit rays (..., 3)."""
@@ -91,6 +97,9 @@ class Surface:
             return np.stack([np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a)], axis=-1)
         if self.kind == "cylindrical":
             ray = np.stack([np.sin(a), b, np.cos(a)], axis=-1)
+        elif self.kind == "pannini":
+            lon = 2 * np.arctan(a / 2)
+            ray = np.stack([np.sin(lon), b * (1 + np.cos(lon)) / 2, np.cos(lon)], axis=-1)
         else:
             ray = np.stack([a, b, np.ones_like(a)], axis=-1)
         return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -119,6 +128,9 @@ class Surface:
                     if self.kind == "equirectangular"
                     else np.where(flat > 0, y / flat, np.nan)
                 )
+                if self.kind == "pannini":
+                    q = 2 / (1 + np.cos(a))
+                    a, b = q * np.sin(a), q * b
         return np.stack([self.cx + self.scale_px * a, self.cy + self.scale_px * b], axis=-1)
 
 
@@ -131,7 +143,7 @@ def choose_surface(
 ) -> Surface:
     """The surface for a shot: kind by the field of view, scale by the finest zoom, crop by the frames' outlines.
 
-    kind 'auto': a plane below 50 degrees in all, a cylinder up to 100 x 60, else equirectangular. px_per_rad: scale
+    kind 'auto': a plane below 50 degrees in all, Pannini up to 100 x 60, else equirectangular. px_per_rad: scale
     to use instead of the finest zoom that 2 % of the frames reach (a single frame gone wrong must not set it).
     max_pixels bounds width x height, whatever the scale asked for. The forward axis falls half-way between two
     pixels (cx, cy = n + .5) and a full equirectangular turn is an even number of pixels: GPano and Hugin count so.
@@ -147,8 +159,8 @@ def choose_surface(
     if kind == "auto":
         if max(pan, tilt) < PLANAR_TOTAL_RAD and np.abs(outlines).max() < PLANAR_SIDE_RAD:
             kind = "planar"
-        elif pan <= CYLINDER_PAN_RAD and tilt <= CYLINDER_TILT_RAD and np.abs(lat).max() < CYLINDER_SIDE_RAD:
-            kind = "cylindrical"
+        elif pan <= PANNINI_PAN_RAD and tilt <= PANNINI_TILT_RAD and np.abs(lat).max() < PANNINI_SIDE_RAD:
+            kind = "pannini"
         else:
             kind = "equirectangular"
     scale = px_per_rad
@@ -203,10 +215,15 @@ def _unit_bounds(
             )
         x, y = np.tan(lon[inside]), -np.tan(lat[inside]) / np.cos(lon[inside])
     else:
-        x = lon
+        x = np.clip(lon, -PANNINI_CUT_RAD, PANNINI_CUT_RAD) if kind == "pannini" else lon
         y = -lat if kind == "equirectangular" else -np.tan(np.clip(lat, -CUT_RAD, CUT_RAD))
+        if kind == "pannini":
+            y = 2 / (1 + np.cos(x)) * y
+            x = 2 * np.tan(x / 2)
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
-    if kind != "planar" and high[0] - low[0] > 2 * np.pi:  # more than a turn: one turn about its middle
+    if (
+        kind in ("equirectangular", "cylindrical") and high[0] - low[0] > 2 * np.pi
+    ):  # more than a turn: one turn about its middle
         low[0], high[0] = (low[0] + high[0]) / 2 - np.pi, (low[0] + high[0]) / 2 + np.pi
     return np.stack([low, high])
 

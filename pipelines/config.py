@@ -255,11 +255,11 @@ class PanoramaOptions(Section):
     """The picture of the whole scene without the players."""
 
     enabled: bool = Field(default=True, description="make the panorama; it takes a second pass over the clip")
-    projection: Literal["auto", "equirectangular", "cylindrical", "planar"] = Field(
+    projection: Literal["auto", "equirectangular", "cylindrical", "planar", "pannini"] = Field(
         default="auto",
         description=(
-            "auto = planar below about 60 degrees of view, cylindrical beyond, equirectangular when it "
-            "also tilts far"
+            "auto = planar below about 50 degrees of view, pannini (upright lines stay straight) to 100, "
+            "equirectangular beyond or when it also tilts far"
         ),
     )
     max_megapixels: float = Field(

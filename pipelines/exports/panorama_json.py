@@ -17,6 +17,7 @@ FORMULAS = {
     "equirectangular": "x = cx + s lon, y = cy - s lat",
     "cylindrical": "x = cx + s lon, y = cy - s tan(lat)",
     "planar": "x = cx + s X / Z, y = cy + s Y / Z",
+    "pannini": "x = cx + s q sin(lon), y = cy - s q tan(lat), q = 2 / (1 + cos(lon))",
 }
 RAY = "(X, Y, Z) = (cos lat sin lon, -sin lat, cos lat cos lon); x right, y down, z forward"
 

@@ -17,7 +17,7 @@ import numpy as np
 from mosaic.surface import Surface
 from pipelines.exports.whole_file import whole_file
 
-PROJECTIONS = {"planar": 0, "cylindrical": 1, "equirectangular": 2}
+PROJECTIONS = {"planar": 0, "cylindrical": 1, "equirectangular": 2, "pannini": 19}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,12 +82,16 @@ def panorama_line(surface: Surface) -> str:
     half_height = int(np.ceil(max(top, surface.height - top)))
     if surface.kind == "planar":
         field = np.degrees(2 * np.arctan(half_width / surface.scale_px))
+    elif surface.kind == "pannini":
+        field = np.degrees(4 * np.arctan(half_width / surface.scale_px / 2))
     else:
         field = np.degrees(2 * half_width / surface.scale_px)
     x0, y0 = round(half_width - left), round(half_height - top)
     crop = f"S{x0},{x0 + surface.width},{y0},{y0 + surface.height}"
+    # Hugin's general Panini, compressed as Pannini's own and with upright lines straight above and below.
+    shape = ' P"100 0 0"' if surface.kind == "pannini" else ""
     return (
-        f"p f{PROJECTIONS[surface.kind]} w{2 * half_width} h{2 * half_height} v{float(field)!r} {crop} "
+        f"p f{PROJECTIONS[surface.kind]} w{2 * half_width} h{2 * half_height} v{float(field)!r} {crop}{shape} "
         'n"TIFF_m" E0 R0'
     )
 

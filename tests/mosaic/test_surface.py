@@ -29,11 +29,32 @@ def test_planar_follows_the_published_formula():
     np.testing.assert_allclose(surface_of("planar").ray_to_pixel([0.6, -0.4, 2.0]), [970.5, 120.5], atol=1e-9)
 
 
+def test_pannini_keeps_upright_lines_and_lines_through_the_middle_straight():
+    lon, lat = 0.7, 0.3
+    q = 2 / (1 + np.cos(lon))
+    ray = np.array([np.cos(lat) * np.sin(lon), -np.sin(lat), np.cos(lat) * np.cos(lon)])
+    surface, middle = surface_of("pannini"), np.array([700.5, 300.5])
+    expected = middle + 900 * q * np.array([np.sin(lon), -np.tan(lat)])
+    np.testing.assert_allclose(surface.ray_to_pixel(ray), expected, atol=1e-9)
+    t = np.linspace(-1, 1, 9)[:, None]
+    upright = surface.ray_to_pixel(np.array([0.8, 0.0, 1.0]) + t * [0.0, 0.5, 0.0])
+    assert np.ptp(upright[:, 0]) < 1e-9
+    through = surface.ray_to_pixel(np.array([0.0, 0.0, 1.0]) + t * [0.9, 0.4, 0.0]) - middle
+    assert np.abs(through[:, 1] - through[:, 0] * 0.4 / 0.9).max() < 1e-9
+    # A touchline: far less bent than on a cylinder.
+    line = np.array([0.0, 0.3, 1.0]) + t * [0.9, 0.0, 0.0]
+    bend = {kind: np.ptp(surface_of(kind).ray_to_pixel(line)[:, 1]) for kind in ("pannini", "cylindrical")}
+    assert bend["pannini"] < 0.6 * bend["cylindrical"]
+
+
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.sampled_from(KINDS), st.floats(-400, 3000), st.floats(-200, 1200), st.floats(-3000, 3000))
 def test_pixel_ray_pixel_is_the_identity(kind, x, y, cx):
     surface = surface_of(kind, cx=cx, cy=450.0)
-    if kind != "planar":  # a longitude is known up to a turn: only pixels within half a turn of the middle
+    if kind not in (
+        "planar",
+        "pannini",
+    ):  # a longitude is known up to a turn: only pixels within half a turn of the middle
         half = np.pi * surface.scale_px
         x = float(np.clip(x, 749.5 - half + 1e-6, 749.5 + half - 1e-6))
     ray = surface.pixel_to_ray([x, y])
@@ -48,7 +69,7 @@ def test_nothing_behind_a_plane_and_nothing_above_a_cylinder():
 
 @pytest.mark.parametrize(
     ("pans_deg", "expected"),
-    [((-8, 8), "planar"), ((-30, 30), "cylindrical"), ((-60, 60), "equirectangular")],
+    [((-8, 8), "planar"), ((-30, 30), "pannini"), ((-60, 60), "equirectangular")],
 )
 def test_kind_follows_the_field_of_view(pans_deg, expected):
     frames = sweep(pans_deg, n=5, f_px=800.0, size_px=(480, 270))  # 33 degrees wide

@@ -15,7 +15,7 @@ import tifffile
 from PIL import Image
 
 from mosaic.composite import Canvas, Panorama
-from mosaic.surface import Surface, choose_surface
+from mosaic.surface import KINDS, Surface, choose_surface
 from pipelines.exports.panorama_jpeg import gpano_fields, scaled_surface, write_panorama_jpeg
 from pipelines.exports.panorama_json import read_surface, write_panorama_json
 from pipelines.exports.panorama_tiff import halve, write_panorama_tiff
@@ -73,7 +73,7 @@ def test_unseen_black_does_not_darken_the_reduced_levels(tmp_path):
     np.testing.assert_array_equal(small[..., 0], [[0, 200, 200]] * 3)
 
 
-@pytest.mark.parametrize("kind", ["cylindrical", "planar"])
+@pytest.mark.parametrize("kind", ["cylindrical", "planar", "pannini"])
 def test_only_equirectangular_pictures_claim_gpano(tmp_path, kind):
     surface = Surface(kind=kind, scale_px=300.0, cx=99.5, cy=49.5, width=200, height=100)
     write_panorama_jpeg(panorama_on(surface), tmp_path / "p.jpg")
@@ -194,7 +194,7 @@ def test_image_line_has_plain_numbers():
     assert numbers == pytest.approx({"r": 0.0, "p": -3.0, "y": 7.25}, abs=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["equirectangular", "cylindrical", "planar"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_panorama_line_puts_the_forward_axis_in_the_canvas_middle(kind):
     surface = choose_surface(sweep((-4, 11), n=5, f_px=700.0, tilt_deg=5.0), kind)
     words = panorama_line(surface).split()
@@ -203,7 +203,8 @@ def test_panorama_line_puts_the_forward_axis_in_the_canvas_middle(kind):
     assert (x1 - x0, y1 - y0) == (surface.width, surface.height) and x0 >= 0 and x1 <= width and y1 <= height
     assert (surface.cx + x0, surface.cy + y0) == ((width - 1) / 2, (height - 1) / 2)
     half = np.radians(field) / 2
-    scale = width / 2 / (np.tan(half) if kind == "planar" else half)
+    edge = {"planar": np.tan(half), "pannini": 2 * np.tan(half / 2)}.get(kind, half)
+    scale = width / 2 / edge
     assert scale == pytest.approx(surface.scale_px, rel=1e-12)
 
 
@@ -220,7 +221,7 @@ def test_pto_refuses_what_hugin_would_misread(tmp_path):
 
 @pytest.mark.oracle
 @pytest.mark.skipif(shutil.which("nona") is None, reason="hugin-tools is not installed")
-@pytest.mark.parametrize("kind", ["equirectangular", "cylindrical", "planar"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("k1", [-0.11, 0.08])
 def test_nona_renders_to_our_place(tmp_path, kind, k1):
     placement = Pinhole(size_px=(640, 360), f_px=800.0, pan_deg=7.5, tilt_deg=-3.2, roll_deg=0.4, k1=k1)
