@@ -1,4 +1,7 @@
-"""Commands besides the main job: export, rays (cli_rays.py) and doctor. `register` puts them into the application."""
+"""Commands besides the main job: export and doctor; rays and render are in cli_rays.py and cli_render.py.
+
+`register` puts them all into the application.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +24,13 @@ FORMAT_HELP = "\n\n".join(f"{entry.name}: {entry.what}" for entry in FORMATS)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands of this module and of cli_rays."""
+    """Add the commands of this module, of cli_rays and of cli_render."""
     from pipelines.cli_rays import rays
+    from pipelines.cli_render import EPILOG, render
 
     app.command("export", epilog=FORMAT_HELP)(export)
     app.command("rays")(rays)
+    app.command("render", epilog=EPILOG)(render)
     app.command("doctor")(doctor)
 
 
