@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from calib import GateOptions, HomographyGraph, Priors, RefineOptions, Solution, fit_pupil, judge, refine
 from calib.camera import N_COLUMNS
 from calib.problem import Loss, PriorTerms, State, linearise, pack, residuals
-from calib.refine import free_columns
+from calib.refine_options import free_columns
 from calib.solver import Layout, NormalEquations
 from tests.calib import tracks
 

@@ -50,7 +50,7 @@ class Parallax:
         return rays - near[..., None] * np.asarray(axis, float)
 
     def from_axis(self, rays: ArrayLike, axis: ArrayLike) -> Array:
-        """Unit directions (..., 3) from the pan axis to what the pupil sees along `rays` (..., 3): from_pupil undone."""
+        """Unit directions (..., 3) from the pan axis to what the pupil sees along rays (..., 3): from_pupil undone."""
         seen = np.asarray(rays, float) @ self.R_head_world.T
         pupil = self.R_head_world @ np.asarray(axis, float)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,10 +14,11 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from calib.covariance import edge_statistics
+from calib.edges import find_bad_edges, linked_to
 from calib.problem import Loss, Packed, State, linearise, pack, robust_scale, whitened_squares
 from calib.records import HomographyGraph, Solution
-from calib.refine import find_bad_edges, linked_to, state_from_solution
 from calib.selected_inverse import inverse_diagonal_blocks
+from calib.starts import state_from_solution
 
 Array = NDArray[np.float64]
 MAX_BAND = 12  # frames: links between free frames that reach further get their error bars from single solves

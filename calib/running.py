@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import rotation, serial
-from calib.gates import GateOptions, systematic_px
+from calib.gates import GateOptions
 from calib.problem import AdaptiveLoss, Linearised, Packed, State, linearise, pack, robust_scale
 from calib.records import HomographyEdge, HomographyGraph, Lens, Priors, Solution
-from calib.refine import RefineOptions, refine, state_from_solution
+from calib.refine import RefineOptions, refine
+from calib.starts import state_from_solution
+from calib.systematic import systematic_px
 
 Array = NDArray[np.float64]
 

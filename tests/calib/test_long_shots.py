@@ -8,7 +8,7 @@ import numpy as np
 
 from calib import HomographyGraph, refine, rotation, solve_poses
 from calib.problem import pack
-from calib.refine import state_from_solution
+from calib.starts import state_from_solution
 from tests.calib import tracks
 
 N_KEYFRAMES, N_BETWEEN = 6, 500

@@ -7,8 +7,8 @@ import pytest
 
 from calib import HomographyGraph, refine, selected_inverse, solver
 from calib.problem import Loss, PriorTerms, linearise, pack
-from calib.refine import state_from_solution
 from calib.selected_inverse import order_frames
+from calib.starts import state_from_solution
 from tests.calib import tracks
 from tests.calib.test_refine import make
 
