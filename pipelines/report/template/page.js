@@ -315,6 +315,13 @@
   window.addEventListener("beforeprint", () => document.querySelectorAll("section.shot details").forEach((d) => { d.open = true; }));
   document.getElementById("cursor").hidden = false;
   drawSwatches(); drawStrip(); drawFilm();
-  select(0);
+  // report.html#frame=120 opens at that frame, or the nearest one that is drawn.
+  const fromAddress = () => {
+    const wanted = /^#frame=(\d+)$/.exec(location.hash);
+    if (wanted) select(data.frame.reduce((best, frame, row) => (Math.abs(frame - wanted[1]) < Math.abs(data.frame[best] - wanted[1]) ? row : best), 0));
+    return wanted !== null;
+  };
+  window.addEventListener("hashchange", fromAddress);
+  if (!fromAddress()) select(0);
   document.documentElement.dataset.ready = plots.length;
 })();
