@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -65,21 +64,3 @@ def measured_without(graph: HomographyGraph, solution: Solution, pupil: PupilFit
     if pupil is None or pupil.parallax is None:
         return graph
     return without_parallax(graph, solution, pupil.parallax)
-
-
-def pupil_facts(pupil: PupilFit | None) -> dict[str, Any] | None:
-    """What run.json says of the pupil; None where the shot was too little calibrated to look for one."""
-    if pupil is None:
-        return None
-    parallax = pupil.parallax
-    return {
-        "accepted": pupil.accepted,
-        "reason": pupil.reason,
-        "sentence": pupil.sentence,
-        "over_height": pupil.over_height,
-        "over_height_std": pupil.over_height_std,
-        "over_stand": pupil.over_stand,
-        "over_stand_std": pupil.over_stand_std,
-        "focal_change": float(np.expm1(pupil.shift_log_f)),
-        "R_head_world": None if parallax is None else parallax.R_head_world.tolist(),
-    }

@@ -38,7 +38,8 @@ from pipelines.keyframe_graph import (
 )
 from pipelines.links import without_doubtful
 from pipelines.moving import MovingFinder
-from pipelines.pupil import measured_without, pupil_facts, with_pupil
+from pipelines.pupil import measured_without, with_pupil
+from pipelines.pupil_facts import pupil_facts
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
 from pipelines.second_pass import second_pass
@@ -441,7 +442,7 @@ def calibration_facts(shot: CalibratedShot, tracker: ShotTracker) -> dict[str, A
             "tilt0_std_deg": float(np.degrees(head.tilt0_std_rad)),
             "rho_std_deg": float(np.degrees(head.rho_std_rad)),
         },
-        "pupil": pupil_facts(shot.keyframes.pupil),
+        "pupil": pupil_facts(shot.keyframes.pupil, head.R_head_world if head.observable else np.eye(3)),
         "keyframes": [int(k) for k in sorted(tracker.keyframes)],
         "keyframe_pairs": len(shot.keyframes.fits),
         "keyframe_pairs_usable": sum(f.usable for f in shot.keyframes.fits),

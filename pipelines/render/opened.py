@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.parallax import Parallax
 from pipelines.archive import read_camera_csv, read_run
 from pipelines.config import DecodeOptions
 from pipelines.decode import Clip, open_clip
 from pipelines.errors import InputError, UserError
+from pipelines.pupil_facts import parallax_of
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.render.views import View, frame_view, homography_view
 from pipelines.report.words import reason_words
@@ -51,7 +53,13 @@ class OpenedRun:
 
     def view(self, row: int) -> View | None:
         """The camera of a row, None where it has none."""
-        return frame_view(self.table, row, self.size_px)
+        shot = int(self.table.shot[row])
+        return frame_view(self.table, row, self.size_px, self._parallax(shot) if shot >= 0 else None)
+
+    def _parallax(self, shot: int) -> Parallax | None:
+        """Of the pupil of a shot's camera: panorama and pitch are seen from the pan axis, frames from the pupil."""
+        record = next((r for r in self.record.shots if r.index == shot), None)
+        return None if record is None else parallax_of(record.calibration)
 
     def shot_views(self, index: int) -> dict[int, View]:
         """Row to view of every frame of a shot that has a camera.

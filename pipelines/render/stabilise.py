@@ -130,6 +130,7 @@ def target_views(
             pp_px=views[row].pp_px,
             aspect=views[row].aspect,
             k1=views[row].k1,
+            parallax=views[row].parallax,
         ).scaled(options.zoom)
         for row, values in zip(rows, path, strict=True)
     }

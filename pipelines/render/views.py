@@ -6,13 +6,14 @@ The conventions are those of rays.py, which does the same for whole columns of c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.distortion import undistorted_radius
+from calib.parallax import Parallax
 from calib.rotation import from_pan_tilt_roll
 from pipelines.records import CameraTable
 
@@ -31,6 +32,8 @@ class View:
 
     The lens bends about pp_px (2,): an ideal offset d becomes d (1 + k1 |(dx / f_px, dy aspect / f_px)|^2). With k1 = 0
     pp_px, f_px and aspect do not matter to the map; f_px is the scale in px per radian, NaN where nobody knows it.
+    parallax: of a pupil that lies on the optical axis `axis` (3,), unit, in front of the point that the directions
+    start from; None: the camera turns about its pupil.
     """
 
     size_px: tuple[int, int]
@@ -39,10 +42,15 @@ class View:
     aspect: float = 1.0
     pp_px: tuple[float, float] = (0.0, 0.0)
     k1: float = 0.0
+    parallax: Parallax | None = None
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def ray_to_pixel(self, rays: ArrayLike) -> FloatArray:
         """Pixels (..., 2) of directions (..., 3), inside the picture or not; NaN behind it or where the lens folds."""
-        q = np.asarray(rays, np.float64) @ self.M.T
+        directions = np.asarray(rays, np.float64)
+        if self.parallax is not None:
+            directions = self.parallax.from_pupil(directions, self.axis)
+        q = directions @ self.M.T
         with np.errstate(invalid="ignore", divide="ignore"):
             front = np.where(q[..., 2] > 0, q[..., 2], np.nan)
             ideal = q[..., :2] / front[..., None]
@@ -63,7 +71,8 @@ class View:
                 stretch = np.where(radius > 0, undistorted_radius(radius, self.k1) / radius, 1.0)
             xy = self.pp_px + d * stretch[..., None]
         homogeneous = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
-        return homogeneous @ np.linalg.inv(self.M).T
+        directions = homogeneous @ np.linalg.inv(self.M).T
+        return directions if self.parallax is None else self.parallax.from_axis(directions, self.axis)
 
     def scaled(self, factor: float) -> View:
         """The same direction with a focal length `factor` times as long, about the picture's middle."""
@@ -86,9 +95,7 @@ class View:
         """The view whose pixels are factor * pixel + shift."""
         S = np.array([[factor, 0, shift[0]], [0, factor, shift[1]], [0, 0, 1.0]])
         pp = (factor * self.pp_px[0] + shift[0], factor * self.pp_px[1] + shift[1])
-        return View(
-            size_px=size_px, M=S @ self.M, f_px=self.f_px * factor, aspect=self.aspect, pp_px=pp, k1=self.k1
-        )  # fmt: skip
+        return replace(self, size_px=size_px, M=S @ self.M, f_px=self.f_px * factor, pp_px=pp)
 
 
 def camera_view(
@@ -99,16 +106,22 @@ def camera_view(
     pp_px: tuple[float, float] | None = None,
     aspect: float = 1.0,
     k1: float = 0.0,
+    parallax: Parallax | None = None,
 ) -> View:
     """The view of a camera with focal length f_px = fx, aspect fx / fy; pp_px None: the picture's middle."""
     x, y = pp_px or ((size_px[0] - 1) / 2, (size_px[1] - 1) / 2)
     K = np.array([[f_px, 0, x], [0, f_px / aspect, y], [0, 0, 1.0]])
     R = from_pan_tilt_roll(*np.asarray(pan_tilt_roll_rad, np.float64))
-    return View(size_px=size_px, M=K @ R, f_px=f_px, aspect=aspect, pp_px=(x, y), k1=k1)
+    return View(
+        size_px=size_px, M=K @ R, f_px=f_px, aspect=aspect, pp_px=(x, y), k1=k1, parallax=parallax,
+        axis=(float(R[2, 0]), float(R[2, 1]), float(R[2, 2])),
+    )  # fmt: skip
 
 
-def frame_view(table: CameraTable, row: int, size_px: tuple[int, int]) -> View | None:
-    """The view of a row of camera.csv; None where the row has no whole camera."""
+def frame_view(
+    table: CameraTable, row: int, size_px: tuple[int, int], parallax: Parallax | None = None
+) -> View | None:
+    """The view of a row of camera.csv; None where the row has no whole camera. parallax: of its shot's pupil."""
     values = [
         float(column[row])
         for column in (
@@ -118,7 +131,9 @@ def frame_view(table: CameraTable, row: int, size_px: tuple[int, int]) -> View |
     if not np.isfinite(values).all():
         return None
     f, pan, tilt, roll, x, y, aspect, k1 = values
-    return camera_view(size_px, f, np.radians([pan, tilt, roll]), pp_px=(x, y), aspect=aspect, k1=k1)
+    return camera_view(
+        size_px, f, np.radians([pan, tilt, roll]), pp_px=(x, y), aspect=aspect, k1=k1, parallax=parallax
+    )
 
 
 def homography_view(table: CameraTable, row: int, size_px: tuple[int, int]) -> View | None:

@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 from av.video.reformatter import Colorspace, Interpolation
 
+from calib.parallax import Parallax
+from calib.records import Lens
+from calib.rotation import from_pan_tilt_roll
 from mosaic.surface import Surface
+from pipelines.bridge import CameraPlacement, CameraPose
 from pipelines.errors import InputError, OutputError
 from pipelines.rays import pixel_to_ray, ray_to_pixel
 from pipelines.render.encode import clock_of, nominal_rate, video_writer
@@ -46,6 +50,23 @@ def test_a_view_is_the_camera_of_its_row() -> None:
         unit = back / np.linalg.norm(back, axis=-1, keepdims=True)
         np.testing.assert_allclose(unit, pixel_to_ray(table, FIRST + i, xy), atol=1e-10)
         assert np.isnan(view.ray_to_pixel(-rays)).all()
+
+
+def test_a_view_with_parallax_is_the_compositors_placement() -> None:
+    lens = Lens(size_px=SIZE, pp_px=np.array([310.0, 190.0]), aspect=1.0, c0=0.04)
+    pose = CameraPose(log_f=float(np.log(900.0)), R=from_pan_tilt_roll(0.2, -0.15, 0.02))
+    parallax = Parallax(over_height=0.04, over_stand=0.006, R_head_world=from_pan_tilt_roll(0.1, 0.05, 0.0))
+    placement = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=pose, parallax=parallax)
+    view = camera_view(
+        SIZE, 900.0, (0.2, -0.15, 0.02), pp_px=(310.0, 190.0), aspect=1.0,
+        k1=float(lens.k1_opencv(pose.log_f)), parallax=parallax,
+    )  # fmt: skip
+    at = np.random.default_rng(0).uniform((0, 0), (639, 359), (50, 2))
+    rays = placement.pixel_to_ray(at)
+    np.testing.assert_allclose(view.ray_to_pixel(rays), at, atol=1e-6)
+    back = view.pixel_to_ray(at)
+    np.testing.assert_allclose(back / np.linalg.norm(back, axis=-1, keepdims=True), rays, atol=1e-9)
+    np.testing.assert_allclose(view.reduced(2).ray_to_pixel(rays), (at - 0.5) / 2, atol=1e-6)
 
 
 def test_changed_views_see_the_same_ray_at_the_changed_pixel() -> None:
