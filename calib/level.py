@@ -73,19 +73,14 @@ def level(solution: Solution, options: LevelOptions | None = None) -> Level:
     gradient = (shaken[:3] - shaken[3:]).T / (2 * eps)
     variance = np.einsum("ni,nij,nj->n", gradient, cov, gradient) + options.roll_floor_rad**2
     weight = 1 / variance
+    around = eps * np.concatenate([np.zeros((1, 2)), np.eye(2), -np.eye(2)])
     best: tuple[float, Array, Array] | None = None
     for start in np.deg2rad(np.arange(-60, 31, 15)):
         x = np.array([start, 0.0])
         normal = np.eye(2)
         for _ in range(30):
-            e = _roll_residuals(R, x[0], x[1])
-            J = np.stack(
-                [
-                    (_roll_residuals(R, *(x + d)) - _roll_residuals(R, *(x - d))) / (2 * eps)
-                    for d in eps * np.eye(2)
-                ],
-                -1,
-            )
+            e, up_0, up_1, down_0, down_1 = _roll_residuals(R, *(x + around).T)
+            J = np.stack([up_0 - down_0, up_1 - down_1], -1) / (2 * eps)
             normal = (J * weight[:, None]).T @ J + np.diag([1e-6, 1 / options.rho_prior_rad**2])
             right = -(J * weight[:, None]).T @ e - np.array([0.0, x[1] / options.rho_prior_rad**2])
             step = np.linalg.solve(normal, right)

@@ -62,17 +62,13 @@ def log(rotations: ArrayLike) -> Array:
 
 def from_pan_tilt_roll(pan_rad: ArrayLike, tilt_rad: ArrayLike, roll_rad: ArrayLike) -> Array:
     """R_cam_world (..., 3, 3) = Rz(-roll) Rx(-tilt) Ry(-pan). pan > 0 turns right, tilt > 0 up, roll > 0 clockwise."""
-    p, t, r = np.broadcast_arrays(*(np.asarray(a, float) for a in (pan_rad, tilt_rad, roll_rad)))
-    zero, one = np.zeros_like(p), np.ones_like(p)
+    p, t, r = (np.asarray(a, float) for a in (pan_rad, tilt_rad, roll_rad))
     cp, sp, ct, st, cr, sr = np.cos(p), np.sin(p), np.cos(t), np.sin(t), np.cos(r), np.sin(r)
-
-    def matrix(*rows: tuple[Array, Array, Array]) -> Array:
-        return np.stack([np.stack(row, -1) for row in rows], -2)
-
-    Ry = matrix((cp, zero, -sp), (zero, one, zero), (sp, zero, cp))
-    Rx = matrix((one, zero, zero), (zero, ct, st), (zero, -st, ct))
-    Rz = matrix((cr, sr, zero), (-sr, cr, zero), (zero, zero, one))
-    return Rz @ Rx @ Ry
+    R = np.empty((*np.broadcast_shapes(p.shape, t.shape, r.shape), 3, 3))
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = cr * cp + sr * st * sp, sr * ct, sr * st * cp - cr * sp
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = cr * st * sp - sr * cp, cr * ct, cr * st * cp + sr * sp
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = ct * sp, -st, ct * cp
+    return R
 
 
 def to_pan_tilt_roll(rotations: ArrayLike) -> tuple[Array, Array, Array]:
