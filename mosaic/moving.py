@@ -44,6 +44,7 @@ GROUND_PX, GROUND_SHRINK = (
 )  # small px: side of the neighbourhood, and the reduction at which it is looked at
 PLAIN_GREY = 16.0  # usual distance from the ground round about, above which that is no plain ground
 HALO, LIFTED = 8, 150  # trust close round what moves; and there where the colour is that of the plain ground
+NEAR, NEAR_AREA_PX = 100, 30  # trust about a body, and small px of the least piece taken for one
 MOMENT_FRAMES = 6  # views nearer than this say the same about a place
 AGREE = 0.8 * 255  # support from which views are taken to agree
 STEP_PX = 16  # spacing of exact map points in the small frame
@@ -124,12 +125,12 @@ Ground = tuple[NDArray[np.uint8], NDArray[np.float32]]
 @dataclass(frozen=True, slots=True, eq=False)
 class _Compared:
     """One small frame against the composite, (h, w) bool: moves, where the frame shows an object before the composite's
-    ground; ghost, where the composite shows one and the frame ground; agrees, where both show what does not fit the
-    ground round about; plain, where the frame shows just that."""
+    ground; ghost, where the composite shows one and the frame ground; foreign, where the frame shows what does not fit
+    the ground round about; plain, where it shows just that."""
 
     moves: NDArray[np.bool_]
     ghost: NDArray[np.bool_]
-    agrees: NDArray[np.bool_]
+    foreign: NDArray[np.bool_]
     plain: NDArray[np.bool_]
 
 
@@ -166,11 +167,12 @@ def _compare(
     strange = STRANGE * usual + DIFFERENT_GREY
     fits, misfits = (0.5 * there > here) & (there > strange), (0.5 * here > there) & (here > strange)
     differs = opened > 0
+    plain = (usual < PLAIN_GREY) & (here < 1.5 * usual + 0.5 * DIFFERENT_GREY)
     return _Compared(
         moves=differs & (misfits | seed[labels] & ~fits),
         ghost=differs & fits,
-        agrees=~differs & seen & (there > strange),
-        plain=(usual < PLAIN_GREY) & (here < 1.5 * usual + 0.5 * DIFFERENT_GREY),
+        foreign=seen & (here > strange) & (~differs | (usual < PLAIN_GREY)),
+        plain=plain,
     )
 
 
@@ -244,11 +246,17 @@ def _still_plane(
     if wrong.any():
         at = expand_map(nodes, STEP_PX, (width, height))
         ghost = cv2.remap(wrong, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0
-        core |= (ghost & one.agrees).astype(np.uint8)
+        core |= (ghost & one.foreign).astype(np.uint8)
     body = cv2.dilate(cv2.morphologyEx(core, cv2.MORPH_CLOSE, _disc(side), borderValue=0), _disc(5))
-    plane = np.where(body > 0, np.uint8(HALO), np.uint8(255))
+    closed = body
+    if known is not None:  # who was seen moving stands as close by
+        moving = cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST) <= DISTRUSTED
+        closed = np.maximum(body, moving.astype(np.uint8))
+    plane = _near_bodies(np.asarray(closed, np.uint8))
+    plane[body > 0] = HALO
     plane[core > 0] = DISTRUSTED
     if known is None:
+        plane[one.plain & (plane == NEAR)] = 255
         plane[one.plain & (plane == HALO)] = LIFTED
         return np.asarray(plane, np.uint8)
     size = (known.shape[1], known.shape[0])
@@ -257,8 +265,26 @@ def _still_plane(
         known = np.asarray(cv2.resize(known, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     plane = np.minimum(cv2.resize(plane, size, interpolation=cv2.INTER_NEAREST), known)
     plain = cv2.resize(one.plain.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    plane[plain & (plane == NEAR)] = 255
     plane[plain & (plane == HALO)] = LIFTED
     return np.asarray(plane, np.uint8)
+
+
+def _near_bodies(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """255, but NEAR about each piece of `found` (h, w, 1 = moves): its own height upwards and a third to the sides.
+
+    Legs before grass are found for certain, the shoulders before a crowd or a hoarding are not. Views in which nobody
+    is near have the say there; where all have somebody, nothing changes between them."""
+    height, width = found.shape
+    plane = np.full((height, width), 255, np.uint8)
+    n, _, stats, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
+    for x, y, w, h, area in stats[1:n]:
+        if area < NEAR_AREA_PX:
+            continue
+        high = min(h, height // 3)
+        side = max(high // 3, 2)
+        plane[max(y - high, 0) : y + h + side, max(x - side, 0) : x + w + side] = NEAR
+    return plane
 
 
 def _disc(width: int, height: int | None = None) -> NDArray[np.uint8]:
