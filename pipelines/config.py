@@ -290,6 +290,10 @@ class OutputOptions(Section):
         le=65500,
         description=("px; widest panorama.jpg: many viewers stop at 16384, the format itself at 65500"),
     )
+    png: bool = Field(default=False, description="panorama.png too: full resolution, with alpha")
+    deepzoom: bool = Field(
+        default=False, description="panorama.dzi and its tiles too, for OpenSeadragon and other viewers"
+    )
     exports: tuple[str, ...] = Field(
         default=(),
         description=(

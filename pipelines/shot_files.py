@@ -12,8 +12,10 @@ from mosaic.composite import Panorama
 from pipelines.archive import to_json, write_arrays
 from pipelines.bridge import CameraPlacement
 from pipelines.config import Config
+from pipelines.exports.panorama_deepzoom import write_panorama_deepzoom
 from pipelines.exports.panorama_jpeg import write_panorama_jpeg
 from pipelines.exports.panorama_json import write_panorama_json
+from pipelines.exports.panorama_png import write_panorama_png
 from pipelines.exports.panorama_tiff import write_panorama_tiff
 from pipelines.exports.pto import PtoFrame, write_pto
 from pipelines.output_folder import OutputFolder
@@ -156,7 +158,7 @@ def thumbnails(tracker: ShotTracker) -> dict[int, bytes]:
 
 
 def write_panorama(folder: OutputFolder, name: str, shot: CalibratedShot, config: Config) -> list[str]:
-    """Stage panorama.tif, .jpg, .json and .pto of a shot; returns the names written."""
+    """Stage panorama.tif, .jpg, .json and .pto of a shot, .png and .dzi where asked for; returns the names written."""
     panorama = shot.panorama
     assert panorama is not None  # the caller asked
     world = "levelled: y along the pan axis" if shot.level.observable else "reference camera"
@@ -168,6 +170,13 @@ def write_panorama(folder: OutputFolder, name: str, shot: CalibratedShot, config
     write_panorama_jpeg(panorama, paths[1], max_width_px=config.output.jpeg_max_width)
     write_panorama_json(panorama, paths[2], world=world, parallax=_parallax_facts(panorama))
     write_pto(paths[3], panorama.surface, pto_frames(panorama))
+    if config.output.png:
+        names.append(f"{name}/panorama.png")
+        write_panorama_png(panorama, folder.stage(names[-1]))
+    if config.output.deepzoom:
+        start = folder.stage(f"{name}/panorama.dzi")
+        written = write_panorama_deepzoom(panorama, start)
+        names += [f"{name}/{path.relative_to(start.parent).as_posix()}" for path in written]
     return names
 
 

@@ -16,8 +16,10 @@ from PIL import Image
 
 from mosaic.composite import Canvas, Panorama
 from mosaic.surface import KINDS, Surface, choose_surface
+from pipelines.exports.panorama_deepzoom import write_panorama_deepzoom
 from pipelines.exports.panorama_jpeg import gpano_fields, scaled_surface, write_panorama_jpeg
 from pipelines.exports.panorama_json import read_surface, write_panorama_json
+from pipelines.exports.panorama_png import write_panorama_png
 from pipelines.exports.panorama_tiff import halve, write_panorama_tiff
 from pipelines.exports.pto import PtoFrame, hugin_lens, image_line, panorama_line, write_pto
 from pipelines.exports.whole_file import whole_file
@@ -251,6 +253,79 @@ def test_nona_renders_to_our_place(tmp_path, kind, k1):
         axis=-1
     )  # at the border nona continues the outer pixels
     assert inside.sum() > 100_000 and np.median(error[inside]) < 0.06 and error[inside].max() < 0.15
+
+
+# --- on demand -------------------------------------------------------------------------------------------------------
+
+
+def test_png_holds_every_pixel_and_says_srgb(tmp_path):
+    panorama = panorama_on(SURFACE)
+    write_panorama_png(panorama, tmp_path / "p.png")
+    with Image.open(tmp_path / "p.png") as picture:
+        assert picture.mode == "RGBA" and "srgb" in picture.info
+        read = np.asarray(picture)
+    np.testing.assert_array_equal(read[..., :3], panorama.image)
+    np.testing.assert_array_equal(read[..., 3], panorama.alpha)
+
+
+def test_deep_zoom_tiles_lie_where_the_format_says(tmp_path):
+    panorama = panorama_on(SURFACE)
+    files = write_panorama_deepzoom(panorama, tmp_path / "panorama.dzi", quality=95)
+    assert set(files) == {p for p in tmp_path.rglob("*") if p.is_file()}
+    image = ElementTree.parse(tmp_path / "panorama.dzi").getroot()
+    space = "{http://schemas.microsoft.com/deepzoom/2008}"
+    assert image.tag == f"{space}Image"
+    side, overlap = int(image.get("TileSize")), int(image.get("Overlap"))
+    size = image.find(f"{space}Size")
+    assert (int(size.get("Width")), int(size.get("Height"))) == (1311, 571)
+    levels = tmp_path / "panorama_files"
+    assert sorted(int(p.name) for p in levels.iterdir()) == list(range(12))  # 2^10 < 1311 <= 2^11
+    for level in range(12):
+        width, height = (-(-n // 2 ** (11 - level)) for n in (1311, 571))
+        whole = np.zeros((height, width, 3))
+        for tile in (levels / str(level)).iterdir():
+            column, row = (int(n) for n in tile.stem.split("_"))
+            with Image.open(tile) as picture:
+                part = np.asarray(picture)
+            left, top = (max(n * side - overlap, 0) for n in (column, row))
+            right, bottom = min((column + 1) * side + overlap, width), min((row + 1) * side + overlap, height)
+            assert part.shape[:2] == (bottom - top, right - left)
+            whole[top:bottom, left:right] = part
+        assert (whole[height // 2 :].max(axis=-1) > 0).all()  # no tile is missing
+        if level == 11:
+            error = (whole - panorama.image)[panorama.alpha > 0]
+            assert np.sqrt(np.mean(error**2)) < 2
+
+
+@pytest.mark.oracle
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="libimage-exiftool-perl is not installed")
+def test_exiftool_reads_where_the_picture_lies(tmp_path):
+    write_panorama_jpeg(panorama_on(SURFACE), tmp_path / "p.jpg")
+    write_panorama_tiff(panorama_on(SURFACE), tmp_path / "p.tif")
+    for name in ("p.jpg", "p.tif"):
+        done = subprocess.run(
+            ["exiftool", "-j", "-n", "-XMP-GPano:all", str(tmp_path / name)], check=True, capture_output=True
+        )
+        [found] = json.loads(done.stdout)
+        expected = gpano_fields(SURFACE)
+        assert {key: str(found[key]) for key in expected if key != "UsePanoramaViewer"} == {
+            key: value for key, value in expected.items() if key != "UsePanoramaViewer"
+        }
+
+
+@pytest.mark.oracle
+@pytest.mark.skipif(shutil.which("vips") is None, reason="libvips-tools is not installed")
+def test_vips_opens_every_level_of_the_tiff(tmp_path):
+    panorama = panorama_on(SURFACE)
+    write_panorama_tiff(panorama, tmp_path / "p.tif")
+    subprocess.run(["vips", "copy", f"{tmp_path / 'p.tif'}", f"{tmp_path / 'full.png'}"], check=True)
+    subprocess.run(
+        ["vips", "copy", f"{tmp_path / 'p.tif'}[subifd=0]", f"{tmp_path / 'half.png'}"], check=True
+    )
+    with Image.open(tmp_path / "full.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture)[..., :3], panorama.image)
+    with Image.open(tmp_path / "half.png") as picture:
+        assert picture.size == (656, 286)
 
 
 # --- whole files -----------------------------------------------------------------------------------------------------
