@@ -1,7 +1,7 @@
 """panorama.dzi and panorama_files/: Deep Zoom tiles, for OpenSeadragon and its like, on demand.
 
 Level n is the whole picture at 2^-(N - n) of its size, N = ceil(log2(longer side)); tiles of 254 px with one px of the
-neighbours on each inner side, column_row.jpg; unseen is black. Source: Deep Zoom file format, Microsoft, schema of 2008.
+neighbours on each inner side, column_row.jpg; unseen is black. Source: Deep Zoom file format, Microsoft, 2008.
 """
 
 from __future__ import annotations
