@@ -100,6 +100,20 @@ def sample(level, sx, sy, dst, mask, mask_sx, mask_sy, use_mask):  # type: ignor
 
 
 @_jit
+def _cubic(t):  # type: ignore[no-untyped-def]
+    """Weights of the pixels at -1, 0, 1, 2 for a value at t in 0..1: cubic convolution with a = -1/2."""
+    t2 = t * t
+    t3 = t2 * t
+    h = np.float32(0.5)
+    return (
+        h * (np.float32(2.0) * t2 - t3 - t),
+        h * (np.float32(3.0) * t3 - np.float32(5.0) * t2) + np.float32(1.0),
+        h * (np.float32(4.0) * t2 - np.float32(3.0) * t3 + t),
+        h * (t3 - t2),
+    )
+
+
+@_jit
 def linearise(level, sx, sy, dst, A, values, gradients, gain, offset, mask, mask_sx, mask_sy, use_mask):  # type: ignore[no-untyped-def]
     """Residuals and second-order (ESM) gradients at the warped points.
 
@@ -134,7 +148,6 @@ def linearise(level, sx, sy, dst, A, values, gradients, gain, offset, mask, mask
         a01 = np.float32(level[iy, ix + _ONE])
         a10 = np.float32(level[iy + _ONE, ix])
         a11 = np.float32(level[iy + _ONE, ix + _ONE])
-        value = (a00 * ex + a01 * fx) * ey + (a10 * ex + a11 * fx) * fy
         left0 = np.float32(level[iy, ix - _ONE])
         left1 = np.float32(level[iy + _ONE, ix - _ONE])
         right0 = np.float32(level[iy, ix + _TWO])
@@ -143,6 +156,20 @@ def linearise(level, sx, sy, dst, A, values, gradients, gain, offset, mask, mask
         up1 = np.float32(level[iy - _ONE, ix + _ONE])
         down0 = np.float32(level[iy + _TWO, ix])
         down1 = np.float32(level[iy + _TWO, ix + _ONE])
+        # Cubic convolution (Keys 1981): linear sampling blurs by up to a quarter px^2, depending on the fraction, and
+        # what it takes from the texture pulls where one fraction holds for the whole picture (a slow pan).
+        x0, x1, x2, x3 = _cubic(fx)
+        y0, y1, y2, y3 = _cubic(fy)
+        corner00 = np.float32(level[iy - _ONE, ix - _ONE])
+        corner03 = np.float32(level[iy - _ONE, ix + _TWO])
+        corner30 = np.float32(level[iy + _TWO, ix - _ONE])
+        corner33 = np.float32(level[iy + _TWO, ix + _TWO])
+        value = (
+            y0 * (x0 * corner00 + x1 * up0 + x2 * up1 + x3 * corner03)
+            + y1 * (x0 * left0 + x1 * a00 + x2 * a01 + x3 * right0)
+            + y2 * (x0 * left1 + x1 * a10 + x2 * a11 + x3 * right1)
+            + y3 * (x0 * corner30 + x1 * down0 + x2 * down1 + x3 * corner33)
+        )
         gx = 0.5 * (
             ((a01 - left0) * ex + (right0 - a00) * fx) * ey + ((a11 - left1) * ex + (right1 - a10) * fx) * fy
         )
@@ -395,4 +422,22 @@ def cell_scores(residual, G, J, weight, cell, n_cells):  # type: ignore[no-untyp
         g1 = np.float64(G[i, 1])
         for k in range(p):
             out[cell[i], k] += wr * (g0 * J[i, 0, k] + g1 * J[i, 1, k])
+    return out
+
+
+@_jit
+def cell_moments(G, J, weight, cell, n_cells):  # type: ignore[no-untyped-def]
+    """Sums (c, p, 2) of w (J^T g) g^T a cell: what accumulate's b becomes when a cell is off by one px in x or y."""
+    p = J.shape[2]
+    out = np.zeros((n_cells, p, 2))
+    for i in range(len(weight)):
+        w = np.float64(weight[i])
+        if w <= 0.0:
+            continue
+        g0 = np.float64(G[i, 0])
+        g1 = np.float64(G[i, 1])
+        for k in range(p):
+            row = w * (g0 * J[i, 0, k] + g1 * J[i, 1, k])
+            out[cell[i], k, 0] += row * g0
+            out[cell[i], k, 1] += row * g1
     return out

@@ -33,6 +33,20 @@ def _bilinear(stack: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Te
     return grid_sample(stack, grid, mode="bilinear", padding_mode="zeros", align_corners=True)[0, :, 0]
 
 
+def _cubic(t: torch.Tensor) -> torch.Tensor:
+    """Weights (n, 4) of the pixels at -1, 0, 1, 2 for values at t (n,): cubic convolution with a = -1/2 (Keys 1981)."""
+    t2, t3 = t * t, t * t * t
+    return 0.5 * torch.stack([2 * t2 - t3 - t, 3 * t3 - 5 * t2 + 2, 4 * t2 - 3 * t3 + t, t3 - t2], dim=-1)
+
+
+def _bicubic(image: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Values (n,) of a picture (h, w) at level pixels at least one inside its border (torch's own has a = -3/4)."""
+    ix, iy = x.floor().long(), y.floor().long()
+    near = torch.arange(-1, 3)
+    patches = image[iy[:, None, None] + near[:, None], ix[:, None, None] + near]
+    return torch.einsum("nr,nrc,nc->n", _cubic(y - iy), patches, _cubic(x - ix))
+
+
 def _usable(dst: torch.Tensor, mask: NDArray[np.uint8], sx: float, sy: float, use_mask: bool) -> torch.Tensor:
     if not use_mask:
         return torch.ones(len(dst), dtype=torch.bool)
@@ -79,7 +93,8 @@ def linearise(
     good = _inside(x, y, level, 2) & _usable(points, *masks) & (det.abs() >= 1e-12)
     image = _image(level)
     stack = torch.cat([image, spatial_gradient(image, mode="diff", normalized=False)[:, 0] * 0.5], dim=1)
-    seen, gx, gy = _bilinear(stack, torch.nan_to_num(x), torch.nan_to_num(y))
+    _, gx, gy = _bilinear(stack, torch.nan_to_num(x), torch.nan_to_num(y))
+    seen = _bicubic(image[0, 0], torch.where(good, x, 2.0), torch.where(good, y, 2.0))
     template = torch.from_numpy(gradients.astype(np.float64))
     safe = torch.where(good[:, None, None], derivative, torch.eye(2, dtype=torch.float64))
     carried = torch.linalg.solve(safe.transpose(1, 2), template[:, :, None])[:, :, 0]
@@ -232,3 +247,19 @@ def cell_scores(
     )
     total = torch.zeros((n_cells, rows.shape[1]), dtype=torch.float64)
     return total.index_add_(0, torch.from_numpy(cell[used]), wr[:, None] * rows).numpy()
+
+
+def cell_moments(
+    G: NDArray[np.float32],
+    J: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    cell: NDArray[np.int64],
+    n_cells: int,
+) -> FloatArray:
+    """See kernel_numba.cell_moments: (c, p, 2)."""
+    used = weight > 0
+    g = torch.from_numpy(G[used].astype(np.float64))
+    rows = torch.einsum("nk,nkp->np", g, torch.from_numpy(J[used].astype(np.float64)))
+    each = torch.from_numpy(weight[used].astype(np.float64))[:, None, None] * rows[:, :, None] * g[:, None, :]
+    total = torch.zeros((n_cells, rows.shape[1], 2), dtype=torch.float64)
+    return total.index_add_(0, torch.from_numpy(cell[used]), each).numpy()

@@ -1,8 +1,8 @@
 """The kernel interface of the estimator and its two implementations, chosen by name.
 
 A kernel is a module with `sample`, `linearise`, `robust_weights`, `robust_scale`, `inlier_scale`, `tukey_cost`,
-`accumulate`, the same by cells (`linearise_cells`, `accumulate_cells`, `cell_steps`, `cell_scores`) and
-`shifted_residuals`, of equal signature and meaning: `kernel_numba` (compiled, CPU video path) and `kernel_torch`
+`accumulate`, the same by cells (`linearise_cells`, `accumulate_cells`, `cell_steps`, `cell_scores`, `cell_moments`)
+and `shifted_residuals`, of equal signature and meaning: `kernel_numba` (compiled, CPU video path) and `kernel_torch`
 (torch / kornia, the reference).
 """
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mosaic.blur import matched, spread_difference
 from mosaic.coords import normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
 from mosaic.gray import as_gray, as_mask, as_planes, white_of
@@ -34,6 +35,8 @@ REASONS = {
 # Failures that say nothing about the pair: a picture that sees five times more cannot be the template of the other.
 _NO_VERDICT = ("low_overlap", "no_texture")
 
+FINE_PX = 1280  # width of the pictures of the second look for features
+
 _RANK = {PairStatus.OK: 0, PairStatus.WEAK: 1, PairStatus.FAILED: 2, PairStatus.SKIPPED: 3}
 
 
@@ -41,11 +44,13 @@ _RANK = {PairStatus.OK: 0, PairStatus.WEAK: 1, PairStatus.FAILED: 2, PairStatus.
 class PairOptions:
     """How two pictures are registered.
 
-    selection, estimator: which pixels, and how they are aligned and judged. rescue: try phase correlation and features
-    where the direct start does not convince. smooth: the 3x3 blur that unbiased sampling wants; off for pictures that
-    are soft already. symmetric_px: how far from where it began the way from a to b and back may end, rms over the
-    measured cells, px of a, before the pair is weak; None: not checked. The score alone passes pairs in which most of
-    the strong gradients belong to things that move by themselves.
+    selection, estimator: which pixels, and how they are aligned and judged; four times as many as for a frame of a
+    video and to the end, since two pictures can wait for it (measured: half the error). match_blur: make pictures of
+    clearly unequal sharpness equal, and align them again (blur.py). rescue: try phase correlation and features where
+    the direct start does not convince. smooth: the 3x3 blur that unbiased sampling wants; off for pictures that are
+    soft already. symmetric_px: how far from where it began the way from a to b and back may end, rms over the measured
+    cells, px of a, before the pair is weak; None: not checked. The score alone passes pairs in which most of the strong
+    gradients belong to things that move by themselves.
     cell_px, max_away: a pair is weak where more than that share of the cells was found farther than cell_px from where
     the homography puts them; max_std_px: or where the anchors' stated error is larger. sure_score, sure_away,
     sure_std_px: when no other start is tried; else the best of all starts is taken, by status and score (measured on
@@ -53,11 +58,18 @@ class PairOptions:
     picture 1280 wide, in proportion above.
     """
 
-    selection: SelectionOptions = field(default_factory=SelectionOptions)
-    estimator: RegisterOptions = field(default_factory=RegisterOptions)
+    selection: SelectionOptions = field(
+        default_factory=lambda: SelectionOptions(n_per_level=(24000, 8000, 2000, 1000, 600, 400))
+    )
+    estimator: RegisterOptions = field(
+        default_factory=lambda: RegisterOptions(
+            max_steps=(8, 6, 6, 8, 10, 10), stop_sigmas=0.05, polish_steps=8, score_ok=0.4
+        )
+    )
     rescue: bool = True
     smooth: bool = True
     symmetric_px: float | None = 1.0
+    match_blur: bool = True
     cell_px: float = 0.5
     max_away: float = 0.3
     max_std_px: float = 0.4
@@ -85,7 +97,8 @@ def register(
     other. kernel: 'numba' (default) or 'torch', the readable reference: equal within 1e-3 px, slower.
 
     Returns PairFit with src = 0 (a), dst = 1 (b): H_dst_src maps px of a into b, det 1, NaN when failed. reason: a
-    code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation' or 'features';
+    code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation', 'features' or
+    'fine features', with ', blur matched' behind it where that was done;
     n_steps counts all that were tried.
     Raises ValueError or TypeError for pictures, masks or a start of the wrong shape, type or value.
     """
@@ -116,6 +129,32 @@ def register_pyramids(
     enough = options.estimator.min_pixels
     # A coarse level too poor to align on is passed over; on the finest level the estimator itself says no_texture.
     levels = [i for i in range(len(template.levels) - 1, 0, -1) if _n_pixels(prepared, i) >= enough] + [0]
+    best = _best_of_starts(source, target, prepared, levels, start, options)
+    if not best.usable or not options.match_blur:
+        return best
+    difference = spread_difference(source, target, best.H_dst_src, best.gain, best.offset)
+    equal = None if difference is None else matched(source, target, difference, best.H_dst_src)
+    if equal is None:
+        return best
+    again, _ = align(
+        prepare(build_template(equal[0], 0, options=options.selection), HomographyFamily(size_px=target.size_px)),
+        equal[1], best.H_dst_src, dst=1, levels=[i for i in (1, 0) if i in levels], options=options.estimator,
+        route=best.route + ", blur matched",
+    )  # fmt: skip
+    again = replace(_judged(again, options), n_steps=best.n_steps + again.n_steps)
+    return again if _order(again) < _order(best) else best
+
+
+def _best_of_starts(
+    source: Pyramid,
+    target: Pyramid,
+    prepared: PreparedTemplate,
+    levels: list[int],
+    start: FloatArray | None,
+    options: PairOptions,
+) -> PairFit:
+    """The first fit that convinces, else the best of all starts."""
+    enough = options.estimator.min_pixels
     best: PairFit | None = None
     reverse: PreparedTemplate | None = None
     n_steps = 0
@@ -148,7 +187,11 @@ def _ladders(route: str, levels: list[int]) -> list[list[int]]:
     A start that may be good begins fine: on a coarse level players are still within reach of each other's pixels and
     draw it away (measured: 40 % players, a start 2.4 px off; from the coarsest level 7 px, from the half .05 px).
     """
-    return [[1, 0], levels] if route in ("start", "features") and levels[0] > 1 and 1 in levels else [levels]
+    return (
+        [[1, 0], levels]
+        if route in ("start", "features", "fine features") and levels[0] > 1 and 1 in levels
+        else [levels]
+    )
 
 
 def _scale_px(fit: PairFit) -> float:
@@ -250,14 +293,20 @@ def _starts(
     found = match_features(small_a, small_b, source.size_px)
     if found is not None:
         yield "features", normalise_homography(scaling @ found)
+    # Players on 40 % of the picture leave few features of the scene: a second look, at twice the size (1 s at 1080p).
+    fine_a, fine_b = _without_masked(source, FINE_PX), _without_masked(target, FINE_PX)
+    if fine_a.shape[1] > small_a.shape[1]:
+        found = match_features(fine_a, fine_b, source.size_px, n_features=5000)
+        if found is not None:
+            yield "fine features", normalise_homography(scaling @ found)
 
 
-def _without_masked(pyramid: Pyramid) -> NDArray[np.uint8]:
+def _without_masked(pyramid: Pyramid, width_px: int = 640) -> NDArray[np.uint8]:
     """The small picture for a rescue, masked pixels filled in from around them.
 
     A masked graphic stands still in both pictures: left in, it makes the peak at zero and matches its own features.
     """
-    small = small_gray(pyramid)
+    small = small_gray(pyramid, width_px)
     if pyramid.mask is None:
         return small
     h, w = small.shape

@@ -40,10 +40,15 @@ def phase_correlation(
 
 
 def match_features(
-    src: NDArray[np.uint8], dst: NDArray[np.uint8], size_px: tuple[int, int], *, min_matches: int = 24
+    src: NDArray[np.uint8],
+    dst: NDArray[np.uint8],
+    size_px: tuple[int, int],
+    *,
+    min_matches: int = 24,
+    n_features: int = 1500,
 ) -> FloatArray | None:
     """H_dst_src (full px, det 1) from SIFT and MAGSAC between two small pictures, or None when nothing convinces."""
-    sift = cv2.SIFT.create(nfeatures=1500)
+    sift = cv2.SIFT.create(nfeatures=n_features)
     key_a, desc_a = sift.detectAndCompute(src, None)
     key_b, desc_b = sift.detectAndCompute(dst, None)
     if desc_a is None or desc_b is None or len(key_a) < min_matches or len(key_b) < min_matches:
