@@ -46,6 +46,7 @@ class Space(StrEnum):
     frame = "frame"
     panorama = "panorama"
     pan_tilt = "pan-tilt"
+    pitch = "pitch"
 
 
 EPILOG = """
@@ -53,7 +54,7 @@ stabilised: every frame as the shot's reference frame sees it, or along the smoo
 
 overlay: a picture put into the scene, players in front of it. --image board.png --at 120 --corners "610,400 700,402
 705,440 612,438": top left, top right, bottom right, bottom left, in px of frame 120; with --in panorama px of
-panorama.tif, with --in pan-tilt degrees.
+panorama.tif, with --in pan-tilt degrees, with --in pitch metres (and --clicks as for the command pitch).
 
 move: keyframes (CSV or JSON: time_s, pan_deg, tilt_deg, hfov_deg, roll_deg) over the panorama, without the clip.
 """
@@ -89,6 +90,10 @@ def render(
         Space, typer.Option("--in", help="overlay: what the corners are given in.")
     ] = Space.frame,
     at: Annotated[int | None, typer.Option(min=0, help="overlay: the frame whose pixels they are.")] = None,
+    clicks: Annotated[
+        Path | None, typer.Option(help="overlay: clicked points of the pitch, for --in pitch.")
+    ] = None,
+    template: Annotated[str, typer.Option(help="overlay: the field whose points the clicks name.")] = "",
     opacity: Annotated[float, typer.Option(min=0, max=1, help="overlay: 0 to 1.")] = 1.0,
     in_front: Annotated[
         bool, typer.Option("--in-front", help="overlay: before the players too; needs no panorama.")
@@ -127,9 +132,14 @@ def render(
             from pipelines.render.overlay import OverlayOptions, overlay
 
             assert image is not None  # _check_options
+            pitch = None
+            if space is Space.pitch:
+                from pipelines.cli_pitch import fitted
+
+                pitch = fitted(out, clicks, template, "", 1.0)
             placing = OverlayOptions(
                 picture=image, corners=_pairs(corners), space=space.value, at=at, opacity=opacity,
-                in_front=in_front, shot=shot, sound=sound, clip=clip,
+                in_front=in_front, shot=shot, sound=sound, clip=clip, pitch=pitch,
             )  # fmt: skip
             done = overlay(run, target, placing, encode=encode, progress=progress)
         else:

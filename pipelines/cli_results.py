@@ -1,4 +1,4 @@
-"""Commands besides the main job: export and doctor; rays, render and serve have modules of their own (cli_*.py).
+"""Commands besides the main job: export and doctor; the others have modules of their own (cli_*.py).
 
 `register` puts them all into the application.
 """
@@ -24,13 +24,16 @@ FORMAT_HELP = "\n\n".join(f"{entry.name}: {entry.what}" for entry in FORMATS)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands of this module, of cli_rays, cli_render and cli_serve."""
+    """Add the commands of this module, of cli_rays, cli_pitch, cli_render and cli_serve."""
+    from pipelines.cli_pitch import flight, pitch
     from pipelines.cli_rays import rays
     from pipelines.cli_render import EPILOG, render
     from pipelines.cli_serve import serve
 
     app.command("export", epilog=FORMAT_HELP)(export)
     app.command("rays")(rays)
+    app.command("pitch")(pitch)
+    app.command("flight")(flight)
     app.command("render", epilog=EPILOG)(render)
     app.command("serve")(serve)
     app.command("doctor")(doctor)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipelines.errors import InputError
 from pipelines.exports.panorama_json import read_surface
+from pipelines.pitch import Pitch
 from pipelines.progress import Progress, silent
 from pipelines.rays import pan_tilt_to_ray
 from pipelines.render.encode import EncodeOptions, video_writer
@@ -27,7 +28,7 @@ from pipelines.render.plate import Plate, fit_light, read_plate
 from pipelines.render.views import View
 
 FloatArray = NDArray[np.float64]
-CornerSpace = Literal["frame", "panorama", "pan-tilt", "rays"]
+CornerSpace = Literal["frame", "panorama", "pan-tilt", "pitch", "rays"]
 
 LIGHT_STEP = 4  # the light of the whole frame is measured on pictures of a quarter of the width
 PAD_PX = 32  # beside the inlay, so that a player who is half in front of it is seen whole enough to be one
@@ -37,9 +38,10 @@ PAD_PX = 32  # beside the inlay, so that a player who is half in front of it is 
 class OverlayOptions:
     """corners: of the picture, top left, top right, bottom right, bottom left, as `space` says:
 
-    'frame' px of frame `at` (4, 2), 'panorama' px (4, 2), 'pan-tilt' degrees (4, 2), 'rays' directions (4, 3) in the
-    shot's world. opacity 0..1. in_front: over the players too, which needs no panorama. shot: whose world is meant, and
-    only its frames are written; None: the shot of frame `at` or the only one, and the whole clip is written.
+    'frame' px of frame `at` (4, 2), 'panorama' px (4, 2), 'pan-tilt' degrees (4, 2), 'pitch' m on the pitch (4, 2),
+    which needs `pitch`, 'rays' directions (4, 3) in the shot's world. opacity 0..1. in_front: over the players too,
+    which needs no panorama. shot: whose world is meant, and only its frames are written; None: the shot of frame `at`
+    or the only one, and the whole clip is written.
     """
 
     picture: Path
@@ -51,6 +53,7 @@ class OverlayOptions:
     shot: int | None = None
     sound: bool = True
     clip: Path | None = None
+    pitch: Pitch | None = None
     matte: MatteOptions = field(default_factory=MatteOptions)
 
 
@@ -125,6 +128,15 @@ def corner_rays(run: OpenedRun, index: int, views: dict[int, View], options: Ove
         return corners
     if options.space == "pan-tilt":
         return pan_tilt_to_ray(corners)
+    if options.space == "pitch":
+        if options.pitch is None:
+            raise InputError(
+                "corners", "are metres on the pitch, but where is it", "give clicked points with --clicks"
+            )
+        try:
+            return options.pitch.to_rays(corners)
+        except ValueError as error:
+            raise InputError("corners", str(error), "check the metres") from None
     if options.space == "panorama":
         return read_surface(run.panorama_path(index).with_suffix(".json")).pixel_to_ray(corners)
     rays = views[run.rows[options.at or 0]].pixel_to_ray(corners)
@@ -205,6 +217,12 @@ def _shot_and_views(run: OpenedRun, options: OverlayOptions) -> tuple[int, dict[
             cause = f"is {run.table.status[row] or 'without a camera'}, so its pixels have no direction"
             raise InputError(f"frame {options.at}", cause, "choose another frame of the shot")
     else:
+        if (
+            options.space == "pitch"
+            and options.pitch is not None
+            and options.shot in (None, options.pitch.shot)
+        ):
+            return options.pitch.shot, run.shot_views(options.pitch.shot)
         calibrated = [record.index for record in run.record.shots if run.calibrated(record.index)]
         index = one_shot(run, calibrated, options.shot, "no shot has a calibrated camera")
         views = run.shot_views(index)
