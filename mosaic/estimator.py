@@ -11,12 +11,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mosaic import kernels
 from mosaic.coords import anchor_information, default_anchors, fit_homography_to_flow
 from mosaic.flow import measure_flow
 from mosaic.level import LevelPair, Linearised, RegisterOptions
 from mosaic.photometric import estimate_gain
+from mosaic.pulled import PulledWarp
 from mosaic.pyramid import Pyramid
 from mosaic.records import FloatArray, FlowGrid, PairFit, PairStatus
 from mosaic.solve import newton_step, step_in_sigmas
@@ -91,7 +93,7 @@ def _align_level(
             now.scale = float("nan")
             return state, steps, now
         weight = kernel.robust_weights(now.residual, np.float32(now.scale), tukey)
-        N, b, _ = kernel.accumulate(now.residual, now.G, now.J, weight)
+        N, b = _normal_equations(pair, state, now, weight, now.scale)
         step = newton_step(N, b, damping)
         if step is None:
             now.scale = float("nan")
@@ -113,6 +115,18 @@ def _align_level(
     return state, steps, now
 
 
+def _normal_equations(
+    pair: LevelPair, state: Any, at: Linearised, weight: NDArray[np.float32], scale: float
+) -> tuple[FloatArray, FloatArray]:
+    """N (p, p) and b (p,) of the pixels, and of what the family knows beforehand, in grey levels^2."""
+    N, b, _ = pair.kernel.accumulate(at.residual, at.G, at.J, weight)
+    family = pair.source.family
+    if isinstance(family, PulledWarp):
+        P, g = family.pull(state)
+        N, b = N + scale**2 * P, b - scale**2 * g
+    return N, b
+
+
 # The scale is this much too large before the finest level is done again with a smaller one.
 _OUTLIERS = 1.15
 
@@ -130,7 +144,7 @@ def _polish(
     steps = 0
     while steps < options.polish_steps and fine.sigma * _OUTLIERS < fine.scale:
         weight = kernel.robust_weights(fine.residual, np.float32(fine.sigma), True)
-        N, b, _ = kernel.accumulate(fine.residual, fine.G, fine.J, weight)
+        N, b = _normal_equations(pair, state, fine, weight, fine.sigma)
         step = newton_step(N, b, 0.0)
         if step is None:
             break
