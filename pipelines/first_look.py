@@ -113,7 +113,7 @@ def _expected_frames(clip: Clip, seconds: float | None) -> int | None:
 
 
 def _shot(tracked: TrackedShot, shrink: int, *, complete: bool = True) -> dict[str, Any]:
-    """ended_by: 'cut', 'end' of the clip, or 'limit': it goes on where the look stopped."""
+    """ended_by: 'cut', 'fade', 'transition', 'end' of the clip, or 'limit': it goes on where the look stopped."""
     seen = tracked.tracker.observations
     motion = np.array([o.motion_px for o in seen[1:]], float)
     motion = shrink * motion[np.isfinite(motion)]
@@ -123,6 +123,6 @@ def _shot(tracked: TrackedShot, shrink: int, *, complete: bool = True) -> dict[s
         "n_frames": len(seen),
         "start_s": float(seen[0].pts_s),
         "end_s": float(seen[-1].pts_s),
-        "ended_by": tracked.end if complete or tracked.end == "cut" else "limit",
+        "ended_by": tracked.end if complete or tracked.end != "end" else "limit",
         "motion_px_per_frame": float(np.median(motion)) if len(motion) else None,
     }

@@ -32,9 +32,10 @@ def probe(
     """The facts of a clip, JSON-ready: ClipFacts.as_dict() with `shots` and `overlays`, whose keys are always there.
 
     shots, overlays: estimated (bool), reason ('' or a code of REASONS) and what was found. shots: list of first_frame,
-    last_frame, n_frames, start_s, end_s, ended_by ('cut', 'end', 'limit' of what was looked at), motion_px_per_frame
-    (median, or None), n_frames, n_frames_in_no_shot, complete (the clip's end was reached), seconds. overlays: as
-    OverlayFinder.facts. `shots` off: only header and two pictures are read. seconds: None looks at the whole clip.
+    last_frame, n_frames, start_s, end_s, ended_by ('cut', 'fade', 'transition', 'end', or 'limit' of what was looked
+    at), motion_px_per_frame (median, or None); n_frames, n_frames_in_no_shot, complete (the clip's end was reached),
+    seconds. overlays: as OverlayFinder.facts. `shots` off: only header and two pictures are read. seconds: None looks
+    at the whole clip.
     Raises InputError as `open_clip` does, and for a clip of one picture.
     """
     config = config or Config()
@@ -114,7 +115,13 @@ def _shot_lines(shots: Mapping[str, Any]) -> list[tuple[str, str]]:
     looked = "" if shots["complete"] else f" in the first {shots['seconds']:g} s"
     left = shots["n_frames_in_no_shot"]
     head = f"{len(found)}{looked}, by a quick look" + (f"; {left} pictures in none" if left else "")
-    ends = {"cut": "then a cut", "end": "then the end", "limit": "and on"}
+    ends = {
+        "cut": "then a cut",
+        "fade": "then a fade",
+        "transition": "then a dissolve, wipe or graphic",
+        "end": "then the end",
+        "limit": "and on",
+    }
     lines = [("shots", head)]
     for number, shot in enumerate(found):
         motion = shot["motion_px_per_frame"]

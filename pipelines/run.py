@@ -36,7 +36,7 @@ from pipelines.report.build import write_report
 from pipelines.shot import Timings, lost_rows, priors_of, solve_shot
 from pipelines.shot_files import thumbnails, write_shot
 from pipelines.shots import ShotSplitter, TrackedShot
-from pipelines.table import FrameFacts, concatenate
+from pipelines.table import FrameFacts, blank_rows, concatenate
 from pipelines.tracking import ShotTracker, selection_of
 
 log = logging.getLogger(__name__)
@@ -70,6 +70,7 @@ class _Job:
     mask: NDArray[np.bool_] | None = None
     n_levels: int = 4
     second: Iterator[Frame] | None = None
+    graphics: dict[int, str] = field(default_factory=dict)  # frames of gradual edits: what they are
 
     def second_frames(self) -> Iterator[Frame]:
         """The second decoding, going on where the shot before ended."""
@@ -143,7 +144,7 @@ def _first_pass(job: _Job) -> None:
         job.images[id(tracker)] = tracker.images
         return tracker
 
-    splitter = ShotSplitter(new_tracker, config.shots.bridge_frames)
+    splitter = ShotSplitter(new_tracker, config.shots.bridge_frames, graphics=job.graphics)
     frames = _selected(job.clip, config)
     expected = job.clip.facts.n_frames_header if config.run.max_frames is None else config.run.max_frames
     count = 0
@@ -248,10 +249,14 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
 
 
 def _whole_table(job: _Job) -> CameraTable:
-    """All pictures of the clip, those outside every shot as 'lost' with a reason."""
+    """All pictures of the clip, those outside every shot as 'graphic' or 'lost' with a reason."""
     seen = {int(f) for table in job.tables for f in table.frame}
     left = [job.facts[f] for f in sorted(job.facts) if f not in seen]
     tables = list(job.tables)
+    for reason in sorted(set(job.graphics.values())):
+        mixed = [facts for facts in left if job.graphics.get(facts.frame) == reason]
+        tables.append(blank_rows(mixed, -1, "graphic", reason))
+    left = [facts for facts in left if facts.frame not in job.graphics]
     if left:
         tables.append(lost_rows(left, "between_shots"))
     return concatenate(tables)

@@ -183,6 +183,13 @@ class ShotTracker:
         """Note a frame that was bridged or lost, so that the shot's list stays complete."""
         self._observe(frame, pts_s, status, reason, float("nan"), None)
 
+    def cut_back(self, last: int) -> None:
+        """Forget all frames after `last`: an edit was found there. Nothing may be stepped afterwards."""
+        self.observations = [o for o in self.observations if o.frame <= last]
+        self.fits = [f for f in self.fits if f.src <= last and f.dst <= last]
+        self.keyframes = {k: key for k, key in self.keyframes.items() if k <= last}
+        self._screen_cells = {k: cells for k, cells in self._screen_cells.items() if k <= last}
+
     # -- registration ------------------------------------------------------------------------------------------
 
     def _free_family(self) -> HomographyFamily:

@@ -64,6 +64,8 @@ REASONS = {
     ),
     "misfit": ("the picture contradicts a camera that only turns and zooms", ""),
     "between_shots": ("the picture belongs to no shot", ""),
+    "fade": ("one shot fades into the next here", ""),
+    "transition": ("a dissolve, wipe or full-screen graphic joins two shots here", ""),
     "bridged": ("the picture's own alignment failed; its camera lies between its neighbours'", ""),
     "focal_error_above_5_percent": ("the focal length is known, but only to worse than 5 %", PAN),
     "too_few_edges": (
