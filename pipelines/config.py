@@ -268,6 +268,9 @@ class PanoramaOptions(Section):
         le=4000,
         description=("megapixels; larger scenes are scaled down; memory and time follow it"),
     )
+    crop: Literal["none", "inside"] = Field(
+        default="none", description="inside = cut to the largest rectangle that was seen without a gap"
+    )
     views: int = Field(
         default=17,
         ge=3,

@@ -22,6 +22,7 @@ from calib.poses import solve_poses
 from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
 from mosaic.composite import Panorama, composite
+from mosaic.cropping import crop_inside
 from mosaic.framestore import FrameStore
 from mosaic.records import MotionGraph, PairFit
 from mosaic.surface import Surface, choose_surface
@@ -187,6 +188,8 @@ def solve_shot(
                 plan, store, placements, surface, options, scratch=scratch,
                 progress=lambda share: progress("composite", round(share * 100), 100),
             )  # fmt: skip
+            if config.panorama.crop == "inside":
+                panorama = crop_inside(panorama)
     finally:
         store.close()
     rows = shot_rows(
