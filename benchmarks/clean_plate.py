@@ -47,12 +47,15 @@ Image = NDArray[np.float32]
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
     """On the panorama's pixels: aligned, placed (h, w, 3) true colours, NaN where nothing was painted. passed (h, w): a
-    player stood there in a frame used; n_clear (h, w): frames used that show the ground."""
+    player stood there in a frame used; n_clear (h, w): frames used that show the ground. clear: of each of them, where
+    (frame h, w) the ground is seen. turn (3, 3): the panorama's world to the true one."""
 
     aligned: Image
     placed: Image
     passed: Mask
     n_clear: NDArray[np.int32]
+    clear: dict[int, Mask]
+    turn: NDArray[np.float64]
 
 
 def clip_spec(seed: int, players: float, n_frames: int) -> ClipSpec:
@@ -69,7 +72,7 @@ def true_picture(clip: SynthClip, run: Path) -> Truth:
         kind=facts["projection"], scale_px=facts["scale_px_per_rad"], cx=facts["centre_px"][0],
         cy=facts["centre_px"][1], width=facts["size_px"][0], height=facts["size_px"][1],
     )  # fmt: skip
-    placed = {p.frame: p for p in _placements(run)}
+    placed = {p.frame: p for p in placements_of_run(run)}
     used = [k for k in facts["frames"] if k in placed]
     x = np.arange(0, surface.width + STEP_PX, STEP_PX)
     y = np.arange(0, surface.height + STEP_PX, STEP_PX)
@@ -77,8 +80,10 @@ def true_picture(clip: SynthClip, run: Path) -> Truth:
     rays, weight = np.zeros(nodes.shape), np.zeros(nodes.shape[:2])
     shape = (surface.height, surface.width)
     n_clear, passed = np.zeros(shape, np.int32), np.zeros(shape, bool)
+    clear: dict[int, Mask] = {}
     for k in used:
         at, frame = placed[k].ray_to_pixel(nodes), clip.frame(k)
+        clear[k] = ~frame.player_mask & ~frame.overlay_mask
         height, width = frame.player_mask.shape
         known = np.isfinite(at).all(axis=-1)
         at = np.where(known[..., None], at, -1e5)
@@ -108,10 +113,11 @@ def true_picture(clip: SynthClip, run: Path) -> Truth:
         return Truth(
             aligned=np.where(_expanded(weight, shape)[..., None] > 0, aligned, np.nan),
             placed=clip.renderer.sample_environment(plain, surface.scale_px), passed=passed, n_clear=n_clear,
+            clear=clear, turn=turn,
         )  # fmt: skip
 
 
-def _placements(run: Path) -> list[CameraPlacement]:
+def placements_of_run(run: Path) -> list[CameraPlacement]:
     """The run's cameras, from its camera.csv alone."""
     table, size_px = read_camera_csv(run / "camera.csv"), read_run(run).clip["size_px"]
     columns = {
