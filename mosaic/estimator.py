@@ -51,7 +51,10 @@ def align(
     masks = mask_arguments(target)
     state = start
     n_steps = 0
-    pair = LevelPair(source, target, levels[0], 1.0, 0.0, masks, kernels.load(options.kernel))
+    pair = LevelPair(
+        source, target, levels[0], 1.0, 0.0, masks, kernels.load(options.kernel),
+        source.family.pull if isinstance(source.family, PulledWarp) else None,
+    )  # fmt: skip
     for index in levels:
         pair.index = index
         pair.gain, pair.offset = _gain(pair, state)
@@ -120,9 +123,8 @@ def _normal_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """N (p, p) and b (p,) of the pixels, and of what the family knows beforehand, in grey levels^2."""
     N, b, _ = pair.kernel.accumulate(at.residual, at.G, at.J, weight)
-    family = pair.source.family
-    if isinstance(family, PulledWarp):
-        P, g = family.pull(state)
+    if pair.pull is not None:
+        P, g = pair.pull(state)
         N, b = N + scale**2 * P, b - scale**2 * g
     return N, b
 

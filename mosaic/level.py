@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,7 +66,11 @@ class Linearised:
 
 @dataclass(slots=True, eq=False)
 class LevelPair:
-    """A template's level and the target's, with gain, offset and masks as the kernel takes them."""
+    """A template's level and the target's, with gain, offset and masks as the kernel takes them.
+
+    pull: what the family knows of its parameters (pulled.py), asked once a pair: asking a protocol takes longer than a
+    small kernel.
+    """
 
     source: PreparedTemplate
     target: Pyramid
@@ -74,6 +79,7 @@ class LevelPair:
     offset: float
     masks: tuple[Any, ...]
     kernel: Any
+    pull: Callable[[Any], tuple[FloatArray, FloatArray]] | None = None
 
     @property
     def pixels(self) -> TemplateLevel:
