@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mosaic.composite import Canvas, CompositeOptions, FrameStore, composite, plan_views
+from mosaic.moving import NEAR, _near_bodies
 from mosaic.surface import choose_surface
 from tests.mosaic.pinhole import Pinhole, sweep
 from tests.mosaic.scenes import clean_plate, composite_of, picture, plan_of, psnr
@@ -146,6 +147,15 @@ def test_slow_players_are_found_by_what_sticks_out(tmp_path):
     assert plain.mean() > 0.02 and left.mean() < 0.002
     away = (found.alpha > 0) & ~seen
     assert psnr(found.image, truth, away) > 38
+
+
+def test_above_legs_that_move_the_view_counts_less_as_high_again_as_they_are():
+    found = np.zeros((90, 160), np.uint8)
+    found[50:70, 80:90] = 1  # legs
+    found[5:7, 5:7] = 1  # a speck is nobody
+    plane = _near_bodies(found)
+    assert (plane[30:76, 74:96] == NEAR).all()
+    assert (plane == NEAR).sum() == 46 * 22 and set(np.unique(plane)) == {NEAR, 255}
 
 
 def test_exposure_and_white_balance_are_levelled(tmp_path):
