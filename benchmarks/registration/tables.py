@@ -185,7 +185,8 @@ def plot(rows: list[Row], path: Path) -> None:
 
 def write_tables(source: Path, out: Path | None, picture: Path | None) -> None:
     """All tables of a run's file to `out` or the terminal, the plot to `picture`."""
-    rows = [json.loads(line) for line in source.read_text(encoding="utf-8").splitlines()]
+    lines = source.read_text(encoding="utf-8").splitlines()
+    rows = list({row["key"]: row for row in map(json.loads, lines)}.values())
     order = list(dict.fromkeys(r["condition"] for r in rows))
     rows = sorted(rows, key=lambda r: (r["size"] != "1080p", order.index(r["condition"]), r["gap"]))
     text = "\n".join([*verdict_table(rows), "", *against_peers(rows), "", *cells_table(rows), ""])
