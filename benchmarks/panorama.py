@@ -6,7 +6,8 @@ Clips of the generator, 720p, with a player who stands still for 40 % of the sho
 of 3 %, a scoreboard. `oracle` is our composite with the true player masks and the true cameras; the others have the
 cameras of our run (panorama_peers.py says what they are). PSNR (dB) and SSIM to the clean environment where players
 passed and five of the frames used show the ground, and elsewhere; one gain per channel is taken off each. SSIM is the
-mean over all that the method and the run have seen. With --crops a strip of crops per clip is written there as JPEG.
+mean over all that the method and the run have seen. Where the run makes several shots of a clip, the first one is
+measured (see the column of frames). With --crops a strip of crops per clip is written there as JPEG.
 """
 
 from __future__ import annotations
@@ -165,6 +166,7 @@ def run_one(
     few = peers.spread_over(frames)
     timings = json.loads((out / "run.json").read_text())["timings_s"]
     made: dict[str, tuple[NDArray[np.uint8], Mask] | None] = {}
+    used = {method: len(frames) for method in ("ours", "oracle", "mean", "feather")} | {"opencv": len(few)}
     seconds: dict[str, float] = {"ours": float(timings["composite"])}
     made["ours"] = np.asarray(cv2.cvtColor(ours, cv2.COLOR_BGRA2RGB), np.uint8), common
     for method in ("oracle", "mean", "feather", "opencv", "hugin"):
@@ -172,7 +174,9 @@ def run_one(
         if method == "oracle":
             made[method] = oracle(clip, truth, surface, pictures, folder)
         elif method == "hugin":
-            made[method] = peers.hugin(surface, pto_frames(placements, few), pictures, few, folder / "hugin")
+            found = peers.hugin(surface, pto_frames(placements, few), pictures, few, folder / "hugin")
+            made[method] = None if found is None else found[:2]
+            used[method] = 0 if found is None else found[2]
         else:
             use = few if method == "opencv" else frames
             make = {"mean": peers.mean, "feather": peers.feather, "opencv": peers.opencv}[method]
@@ -185,8 +189,7 @@ def run_one(
             continue
         target = truth.placed if method == "oracle" else truth.aligned
         row, levelled[method] = figures(*result, target, truth, common)
-        n = len(few) if method in ("opencv", "hugin") else len(frames)
-        rows.append((method, n, row | {"seconds": seconds[method]}))
+        rows.append((method, used[method], row | {"seconds": seconds[method]}))
         cv2.imwrite(str(folder / f"{method}.png"), cv2.cvtColor(levelled[method], cv2.COLOR_RGB2BGR))
     if crops is not None:
         crops.mkdir(parents=True, exist_ok=True)

@@ -114,8 +114,10 @@ def hugin(
     pictures: Mapping[int, Picture],
     numbers: list[int],
     folder: Path,
-) -> tuple[Picture, Mask] | None:
-    """nona and enblend from our project; None where they are not installed."""
+) -> tuple[Picture, Mask, int] | None:
+    """nona and enblend from our project, and how many frames they took; None where they are not installed.
+
+    Where enblend refuses frames that overlap too much, every second one is taken, until it does not."""
     if shutil.which("nona") is None or shutil.which("enblend") is None:
         return None
     folder.mkdir(exist_ok=True)
@@ -127,7 +129,15 @@ def hugin(
     x0, x1, y0, y1 = (int(v) for v in panorama_line(surface).split(" S")[1].split()[0].split(","))
     views = sorted(p.name for p in folder.glob("view*.tif"))
     place = f"-f{x1 - x0}x{y1 - y0}+{x0}+{y0}"
-    subprocess.run(["enblend", place, "-o", "out.tif", *views], **quiet)
+    while True:
+        done = subprocess.run(
+            ["enblend", place, "-o", "out.tif", *views], cwd=folder, capture_output=True, text=True
+        )
+        if done.returncode == 0:
+            break
+        if "excessive image overlap" not in done.stderr or len(views) < 3:
+            raise RuntimeError(f"enblend: {done.stderr.strip()}")
+        views = views[::2]
     picture = cv2.imread(str(folder / "out.tif"), cv2.IMREAD_UNCHANGED)
     assert picture is not None and picture.shape[:2] == (surface.height, surface.width)
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2RGB), np.uint8), picture[..., 3] > 0
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2RGB), np.uint8), picture[..., 3] > 0, len(views)
