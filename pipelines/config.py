@@ -93,12 +93,12 @@ class OverlayOptions(Section):
         default=True, description=("look for fixed graphics and keep them out of registration")
     )
     sample_motion: float = Field(
-        default=0.05,
+        default=0.008,
         gt=0,
         le=1,
         description=(
-            "widths of the frame that the camera moves between two samples; when it rests everything "
-            "looks fixed"
+            "widths of the frame that the camera moves between two samples: twelve in 5 degrees; when it rests "
+            "everything looks fixed"
         ),
     )
     min_samples: int = Field(
@@ -125,7 +125,7 @@ class OverlayOptions(Section):
         ),
     )
     dilate_px: int = Field(
-        default=3,
+        default=2,
         ge=0,
         le=64,
         description=(

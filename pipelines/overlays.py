@@ -19,8 +19,12 @@ from pipelines.config import OverlayOptions
 
 SCALE = 4  # a graphic narrower than two such pixels is below what registration notices
 MEMORY = 60  # samples after which old ones fade, so that a board that goes away is let go
+EARLY, SPARSE = 3, 5  # times min_samples of them come fast; then so many times rarer: they cost 4 ms at 1080p
 MOVING_PX = 0.5  # motion per frame below which the camera rests; jitter must not add up to a pan
-SEED_T = 6.0  # mean edge strength over its standard error: Student's t with 11 degrees makes 5e-5 false seeds
+# Mean edge strength over its standard error. Samples so near to each other share some of their scene, so Student's t is
+# too hopeful: a graphic needs strong seeds, and weak ones belong to it that lie near those.
+STRONG_T, SEED_T = 10.0, 5.0
+NEAR_STRONG = 2  # quarter px; three times that when samples come rarely
 JOIN = 4  # quarter px; seeds this near belong to one graphic: the gap between two words
 MIN_SEEDS = 6  # of each direction in a graphic
 DARK_GREY = (
@@ -66,9 +70,13 @@ class OverlayFinder:
         self._n_updates += 1
         if np.isfinite(motion_px) and motion_px >= MOVING_PX:
             self._since_px += motion_px
-        if self._since_px >= self.options.sample_motion * self.size_px[0]:
+        if self._since_px >= self.options.sample_motion * self.size_px[0] * (1 if self._is_early else SPARSE):
             self._since_px = 0.0
             self._sample(gray)
+
+    @property
+    def _is_early(self) -> bool:
+        return self.n_samples < EARLY * self.options.min_samples
 
     def mask(self) -> NDArray[np.bool_] | None:
         """(h, w) bool, True = scene; None: nothing found, or not enough seen to say."""
@@ -147,17 +155,19 @@ class OverlayFinder:
         std, std_x, std_y = np.sqrt(self._moments[:, 1])
         mean_x, mean_y = np.abs(self._moments[1:, 0])
         # Above one deviation always: after many samples a tiny but steady slope (vignetting) would pass the test.
-        least = max(1.0, SEED_T / np.sqrt(n))
-        seed_x = (mean_x > self.options.min_gradient_grey) & (mean_x > least * std_x)
-        seed_y = (mean_y > self.options.min_gradient_grey) & (mean_y > least * std_y)
-        seeds = seed_x | seed_y
+        edge_x = np.where(mean_x > self.options.min_gradient_grey, mean_x / np.maximum(std_x, 1e-3), 0.0)
+        edge_y = np.where(mean_y > self.options.min_gradient_grey, mean_y / np.maximum(std_y, 1e-3), 0.0)
+        strong_x, strong_y = (edge > max(1.0, STRONG_T / np.sqrt(n)) for edge in (edge_x, edge_y))
+        reach = NEAR_STRONG if self._is_early else 3 * NEAR_STRONG
+        near = ndimage.binary_dilation(strong_x | strong_y, _disc(reach))
+        seeds = near & (np.maximum(edge_x, edge_y) > max(1.0, SEED_T / np.sqrt(n)))
         fixed = std < self.options.max_std_grey
         groups, n_groups = ndimage.label(ndimage.binary_dilation(seeds, _disc(JOIN)))
         found = np.zeros_like(seeds)
         for group, box in zip(range(1, n_groups + 1), ndimage.find_objects(groups), strict=True):
             mine = groups[box] == group
             # The top edge of the hoardings stays in its row while the camera pans: a graphic has edges both ways.
-            if min((seed_x[box] & mine).sum(), (seed_y[box] & mine).sum()) < MIN_SEEDS:
+            if min((strong_x[box] & mine).sum(), (strong_y[box] & mine).sum()) < MIN_SEEDS:
                 continue
             own = seeds[box] & mine
             inside = own | (_between(own) & fixed[box])

@@ -18,7 +18,7 @@ import av
 import numpy as np
 
 from tests.synth.camera import SynthCamera
-from tests.synth.graphics import Overlay, logo, scoreboard
+from tests.synth.graphics import Overlay, logo, scoreboard, ticker
 from tests.synth.paths import CameraPath, LensSpec, PathSpec, ease
 from tests.synth.players import Squad, draw_players, make_squad
 from tests.synth.render import Look, Renderer, finish
@@ -63,6 +63,7 @@ class ClipSpec:
     crowd_sway_m: float = 0.0
     scoreboard: bool = True
     logo: bool = True
+    ticker: bool = False
     noise_grey: float = 2.0
     exposure_drift: float = 0.03
     exposure_ramp_stops: float = 0.0
@@ -128,6 +129,8 @@ class SynthClip:
             self._overlays.append(scoreboard(spec.width, spec.height))
         if spec.logo:
             self._overlays.append(logo(spec.width, spec.height))
+        if spec.ticker:
+            self._overlays.append(ticker(spec.width, spec.height))
 
     def source_index(self, index: int) -> int:
         """The frame whose picture frame `index` shows: itself, or the one before where the clip repeats one."""

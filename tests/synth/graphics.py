@@ -1,4 +1,4 @@
-"""What is fixed on the screen: an opaque scoreboard with a running clock, a half-transparent channel logo."""
+"""What is fixed on the screen: a scoreboard with a running clock, a half-transparent channel logo, a running ticker."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ class Overlay:
     y: int
     clock_at: tuple[int, int] | None = None
     clock_scale: float = 1.0
+    runs_px_s: float = 0.0  # speed of the letters that run behind the part left of runs_from, 0: none
+    runs_from: int = 0
+    running: np.ndarray | None = None  # (h, any, 3) uint8, repeated
 
     def draw(self, image: np.ndarray, mask: np.ndarray, time_s: float) -> None:
         """Blend into image (h, w, 3) uint8 and mark mask (h, w) bool."""
@@ -37,6 +40,10 @@ class Overlay:
             )
             rgba = np.dstack([rgb.astype(np.float32), rgba[..., 3]])
         h, w = rgba.shape[:2]
+        if self.running is not None:
+            rgba = rgba.copy()
+            at = (np.arange(w - self.runs_from) + round(self.runs_px_s * time_s)) % self.running.shape[1]
+            rgba[:, self.runs_from :, :3] = self.running[:, at]
         part = image[self.y : self.y + h, self.x : self.x + w]
         alpha = rgba[..., 3:]
         part[:] = (part * (1 - alpha) + rgba[..., :3] * alpha + 0.5).astype(np.uint8)
@@ -92,3 +99,33 @@ def logo(width: int, height: int) -> Overlay:
     alpha = cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA).astype(np.float32) / 255 * 0.5
     rgba = np.dstack([np.full((size, size, 3), 250, np.float32), alpha])
     return Overlay(rgba=rgba, x=round(width * 0.95) - size, y=round(height * 0.05))
+
+
+def ticker(width: int, height: int) -> Overlay:
+    """Opaque bar over the lower 60 % of the width: a label that stands, news that run by."""
+    w, h = round(width * 0.6), round(height * 0.055)
+    scale = h / 44
+    thick = max(1, round(1.8 * scale))
+
+    def lettered(length: int, colour: tuple[int, int, int], text: str) -> np.ndarray:
+        bar = np.zeros((h, length, 3), np.uint8)
+        bar[:] = colour
+        cv2.putText(
+            bar, text, (round(0.15 * h), round(h * 0.74)), cv2.FONT_HERSHEY_DUPLEX, scale, (255, 255, 255), thick,
+            cv2.LINE_AA,
+        )  # fmt: skip
+        return bar
+
+    label = lettered(w // 5, (190, 30, 30), "NEWS")
+    running = lettered(
+        3 * w, (24, 26, 34), "CUP FINAL ON SUNDAY + TRANSFER OF THE YEAR + RAIN IN THE NORTH + "
+    )
+    box = np.concatenate([label, running[:, : w - w // 5]], axis=1).astype(np.float32)
+    return Overlay(
+        rgba=np.dstack([box, np.ones((h, w), np.float32)]),
+        x=round(width * 0.2),
+        y=round(height * 0.9),
+        runs_px_s=width * 0.08,
+        runs_from=w // 5,
+        running=running,
+    )
