@@ -92,6 +92,13 @@ class OverlayOptions(Section):
     enabled: bool = Field(
         default=True, description=("look for fixed graphics and keep them out of registration")
     )
+    mask_file: str | None = Field(
+        default=None,
+        description=(
+            "picture of the clip's size, white = scene, black = covered, taken instead of what would be found; "
+            "none = look for graphics"
+        ),
+    )
     sample_motion: float = Field(
         default=0.008,
         gt=0,

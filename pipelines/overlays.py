@@ -8,6 +8,7 @@ Not found: graphics that appear for fewer than `min_samples` samples; those are 
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipelines.config import OverlayOptions
+from pipelines.errors import ConfigError
 
 SCALE = 4  # a graphic narrower than two such pixels is below what registration notices
 MEMORY = 60  # samples after which old ones fade, so that a board that goes away is let go
@@ -41,6 +43,7 @@ class OverlayFinder:
         self.size_px = size_px
         self.options = options or OverlayOptions()
         w, h = size_px
+        self._given = None if self.options.mask_file is None else read_mask(self.options.mask_file, size_px)
         small = (h // SCALE, w // SCALE)
         self.n_samples = 0
         self._since_px = np.inf
@@ -59,7 +62,7 @@ class OverlayFinder:
         NaN motion (a frame that was not registered) and small jitter count as rest. Costs nothing on most frames.
         Raises ValueError when the size is not the one of the finder.
         """
-        if not self.options.enabled:
+        if not self.options.enabled or self._given is not None:
             return
         if gray.shape != (self.size_px[1], self.size_px[0]):
             raise ValueError(
@@ -125,6 +128,15 @@ class OverlayFinder:
             "graphics": [],
             "bars": {},
         }
+        if self._given is not None and self.options.enabled:
+            covered = ~self._given
+            facts |= {
+                "graphics": _boxes(covered),
+                "reason": "",
+                "masked_share": float(covered.mean()),
+            }
+            facts["mask_file"] = self.options.mask_file
+            return self._given.copy(), facts
         overlay = np.zeros((h, w), bool)
         top, bottom = _bars(self._dark_rows, self._n_bar)
         left, right = _bars(self._dark_columns, self._n_bar)
@@ -186,11 +198,30 @@ class OverlayFinder:
         if self.options.dilate_px and full.any():
             away = cv2.distanceTransform((~full).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
             full = away <= self.options.dilate_px
-        boxes = []
-        for rows, columns in ndimage.find_objects(ndimage.label(full)[0]):
-            x, y = int(columns.start), int(rows.start)
-            boxes.append({"x": x, "y": y, "w": int(columns.stop) - x, "h": int(rows.stop) - y})
-        return full, boxes
+        return full, _boxes(full)
+
+
+def read_mask(path: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """(h, w) bool, True = scene: where a user's picture is brighter than the middle.
+
+    Raises ConfigError: unreadable, another size, all of it covered.
+    """
+    try:
+        coded = np.frombuffer(Path(path).read_bytes(), np.uint8)
+    except OSError as error:
+        raise ConfigError(path, f"cannot be read ({error.strerror})", "check the path") from None
+    picture = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE) if len(coded) else None
+    if picture is None:
+        raise ConfigError(path, "cannot be read as a picture", "give a PNG of the clip's size, white = scene")
+    if picture.shape != (size_px[1], size_px[0]):
+        size = f"{picture.shape[1]}x{picture.shape[0]}"
+        raise ConfigError(
+            path, f"is {size}, the clip {size_px[0]}x{size_px[1]}", "give a mask of the clip's size"
+        )
+    scene = np.asarray(picture > 127)
+    if not scene.any():
+        raise ConfigError(path, "covers the whole picture", "white is the scene, black what is covered")
+    return scene
 
 
 def both_masks(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -198,6 +229,15 @@ def both_masks(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDAr
     if a is None or b is None:
         return b if a is None else a
     return a & b
+
+
+def _boxes(covered: NDArray[np.bool_]) -> list[dict[str, int]]:
+    """x, y, w, h in px of each connected region."""
+    boxes = []
+    for rows, columns in ndimage.find_objects(ndimage.label(covered)[0]):
+        x, y = int(columns.start), int(rows.start)
+        boxes.append({"x": x, "y": y, "w": int(columns.stop) - x, "h": int(rows.stop) - y})
+    return boxes
 
 
 def _shrink(gray: NDArray[Any]) -> NDArray[np.float32]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipelines.config import OverlayOptions
+from pipelines.errors import ConfigError
 from pipelines.overlays import OverlayFinder
 
 W, H = 480, 272
@@ -136,3 +139,29 @@ def test_float_frames_and_odd_sizes() -> None:
     assert usable is not None and usable.shape == (H - 1, W - 3) and not usable[36, 60]
     with pytest.raises(ValueError, match="480x272"):
         finder.update(np.zeros((H, W), np.uint8), 1.0)
+
+
+def test_a_mask_file_is_taken_instead_of_what_would_be_found(tmp_path: Path) -> None:
+    picture = np.full((H, W), 255, np.uint8)
+    picture[100:140, 200:300] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), picture)
+    finder = OverlayFinder((W, H), OverlayOptions(mask_file=str(tmp_path / "mask.png")))
+    for moving in frames(30, 24.0):
+        finder.update(moving, 24.0)
+    usable = finder.mask()
+    assert usable is not None
+    np.testing.assert_array_equal(usable, picture > 0)
+    facts = finder.facts()
+    assert facts["graphics"] == [{"x": 200, "y": 100, "w": 100, "h": 40}] and facts["mask_file"].endswith(
+        "mask.png"
+    )
+
+
+@pytest.mark.parametrize("kind", ["missing", "size", "black"])
+def test_a_mask_file_that_cannot_be_meant_is_refused(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "mask.png"
+    if kind != "missing":
+        value = 0 if kind == "black" else 255
+        cv2.imwrite(str(path), np.full((H, W if kind == "black" else W - 2), value, np.uint8))
+    with pytest.raises(ConfigError, match=r"mask\.png"):
+        OverlayFinder((W, H), OverlayOptions(mask_file=str(path)))
