@@ -68,6 +68,7 @@ def examine() -> list[Finding]:
     groups: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
         ("versions", versions),
         ("codecs", codecs),
+        ("codecs", encoders),
         ("gpu", gpu),
         ("threads", threads),
         ("optional", optional),
@@ -143,6 +144,20 @@ def codecs() -> Iterator[Finding]:
             found=f"decoder, {use}" if there else f"no decoder, {use}",
             state="ok" if there else "missing",
             cure="" if there else "pip install --upgrade av",
+        )
+
+
+def encoders() -> Iterator[Finding]:
+    """What `render` writes with."""
+    import av
+
+    try:
+        av.codec.Codec("libx264", "w")
+        yield Finding(group="codecs", name="libx264", found="encoder, for render")
+    except ValueError:  # PyAV's UnknownCodecError is one
+        cure = "pip install --upgrade av"
+        yield Finding(
+            group="codecs", name="libx264", found="no encoder, for render", state="missing", cure=cure
         )
 
 

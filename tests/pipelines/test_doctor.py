@@ -52,6 +52,18 @@ def test_a_package_that_cannot_be_loaded_is_a_problem_with_a_cure(
     assert "libgfortran.so.5" in line and "pip install scipy" in line
 
 
+def test_what_render_writes_with_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    import av
+
+    assert by_name(doctor.examine())["codecs", "libx264"].state == "ok"
+    without = SimpleNamespace(
+        Codec=lambda name, mode: (_ for _ in ()).throw(av.codec.codec.UnknownCodecError(name))
+    )
+    monkeypatch.setattr(av.codec, "codec", without)
+    (finding,) = doctor.encoders()
+    assert finding.state == "missing" and finding.cure
+
+
 def test_two_opencv_builds_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     def two() -> Iterator[Any]:
         for name in ("opencv-contrib-python-headless", "opencv_python", "numpy"):
