@@ -56,10 +56,11 @@ def test_what_render_writes_with_is_looked_for(monkeypatch: pytest.MonkeyPatch) 
     import av
 
     assert by_name(doctor.examine())["codecs", "libx264"].state == "ok"
-    without = SimpleNamespace(
-        Codec=lambda name, mode: (_ for _ in ()).throw(av.codec.codec.UnknownCodecError(name))
-    )
-    monkeypatch.setattr(av.codec, "codec", without)
+
+    def unknown(name: str, mode: str) -> None:
+        raise ValueError(f"{name}: no such encoder")
+
+    monkeypatch.setattr(av.codec, "Codec", unknown)
     (finding,) = doctor.encoders()
     assert finding.state == "missing" and finding.cure
 
