@@ -113,7 +113,7 @@ def _expected_frames(clip: Clip, seconds: float | None) -> int | None:
 
 
 def _shot(tracked: TrackedShot, shrink: int, *, complete: bool = True) -> dict[str, Any]:
-    """ended_by: 'cut', 'fade', 'transition', 'end' of the clip, or 'limit': it goes on where the look stopped."""
+    """ended_by: 'cut', 'fade', 'transition', 'lost' track, 'end' of the clip, 'limit': the look ended there."""
     seen = tracked.tracker.observations
     motion = np.array([o.motion_px for o in seen[1:]], float)
     motion = shrink * motion[np.isfinite(motion)]

@@ -32,10 +32,10 @@ def probe(
     """The facts of a clip, JSON-ready: ClipFacts.as_dict() with `shots` and `overlays`, whose keys are always there.
 
     shots, overlays: estimated (bool), reason ('' or a code of REASONS) and what was found. shots: list of first_frame,
-    last_frame, n_frames, start_s, end_s, ended_by ('cut', 'fade', 'transition', 'end', or 'limit' of what was looked
-    at), motion_px_per_frame (median, or None); n_frames, n_frames_in_no_shot, complete (the clip's end was reached),
-    seconds. overlays: as OverlayFinder.facts. `shots` off: only header and two pictures are read. seconds: None looks
-    at the whole clip.
+    last_frame, n_frames, start_s, end_s, ended_by ('cut', 'fade', 'transition', 'lost' registration, 'end', or 'limit'
+    of what was looked at), motion_px_per_frame (median, or None); n_frames, n_frames_in_no_shot, complete (the clip's
+    end was reached), seconds. overlays: as OverlayFinder.facts. `shots` off: only header and two pictures are read.
+    seconds: None looks at the whole clip.
     Raises InputError as `open_clip` does, and for a clip of one picture.
     """
     config = config or Config()
@@ -119,6 +119,7 @@ def _shot_lines(shots: Mapping[str, Any]) -> list[tuple[str, str]]:
         "cut": "then a cut",
         "fade": "then a fade",
         "transition": "then a dissolve, wipe or graphic",
+        "lost": "then registration is lost",
         "end": "then the end",
         "limit": "and on",
     }

@@ -28,7 +28,8 @@ KEPT = LAG + 6  # frames from which a new shot can begin again; 3.5 MB each at 1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedShot:
-    """A finished shot of pass one: its tracker, and why it ended ('cut', 'fade', 'transition' or 'end')."""
+    """A finished shot of pass one: its tracker, and why it ended: 'cut', 'fade', 'transition', 'end' of the clip, or
+    'lost': registration broke off without an edit that would say why."""
 
     tracker: ShotTracker
     end: str
@@ -100,9 +101,9 @@ class ShotSplitter:
             yield from self._follow(kept)
 
     def _let_go(self) -> Iterator[TrackedShot]:
-        """No edit explains the break: the shot before it ended there."""
+        """No edit explains the break: the shot before it ended where registration was lost."""
         if self._ended is not None:
-            yield TrackedShot(tracker=self._ended, end="cut")
+            yield TrackedShot(tracker=self._ended, end="lost")
             self._ended = None
             if self._edits is not None and self._current is not None:
                 self._edits.begin(self._current.observations[0].frame)
@@ -132,7 +133,7 @@ class ShotSplitter:
         """The clip has ended: hand out what is left."""
         yield from self._let_go()
         if self._current is not None:
-            yield TrackedShot(tracker=self._current, end="cut" if self._break else "end")
+            yield TrackedShot(tracker=self._current, end="lost" if self._break else "end")
         if self._break is not None:
             yield TrackedShot(tracker=self._break.tracker, end="end")
         self._current, self._break = None, None

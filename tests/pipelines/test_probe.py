@@ -65,13 +65,13 @@ def test_probe_finds_the_cut_and_the_scoreboard(clip: Path, capsys: pytest.Captu
 
 
 def test_probe_stops_where_it_is_told(clip: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["probe", str(clip), "--seconds", "0.6", "--json"]) == 0
+    assert cli.main(["probe", str(clip), "--seconds", "0.4", "--json"]) == 0
     shots = json.loads(capsys.readouterr().out)["shots"]
-    assert (shots["n_frames"], shots["seconds"], shots["complete"]) == (15, 0.6, False)
-    assert [(s["last_frame"], s["ended_by"]) for s in shots["list"]] == [(14, "limit")]
-    assert cli.main(["probe", str(clip), "--seconds", "0.6"]) == 0
+    assert (shots["n_frames"], shots["seconds"], shots["complete"]) == (10, 0.4, False)
+    assert [(s["last_frame"], s["ended_by"]) for s in shots["list"]] == [(9, "limit")]
+    assert cli.main(["probe", str(clip), "--seconds", "0.4"]) == 0
     shown = capsys.readouterr()
-    assert "1 in the first 0.6 s" in shown.out and "moved too little" in shown.out and shown.err == ""
+    assert "1 in the first 0.4 s" in shown.out and "moved too little" in shown.out and shown.err == ""
 
 
 def test_without_shots_the_keys_are_the_same_and_nothing_is_registered(
