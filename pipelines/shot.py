@@ -37,7 +37,7 @@ from pipelines.keyframe_graph import (
     refine_keyframes,
     register_pairs,
 )
-from pipelines.links import without_doubtful
+from pipelines.links import contradicted_frames, without_doubtful
 from pipelines.moving import MovingFinder
 from pipelines.pupil import measured_without, with_pupil
 from pipelines.pupil_facts import pupil_facts
@@ -181,9 +181,8 @@ def solve_shot(
             solution = _poses(tracker, result, [*fits, *_steps(tracker)])
             solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
         with timings.measure("composite"):
-            placements = placements_of(
-                solution, world, tracker.observations, tracker.size_px, result.parallax
-            )
+            fitting = replace(solution, log_f=np.where(contradicted_frames(solution), np.nan, solution.log_f))
+            placements = placements_of(fitting, world, tracker.observations, tracker.size_px, result.parallax)
             panorama = composite(
                 plan, store, placements, surface, options, scratch=scratch,
                 progress=lambda share: progress("composite", round(share * 100), 100),

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.edits import LAG, EditFinder
+from mosaic.records import PairStatus
+from pipelines.edits import LAG, EditFinder, EditFound
 from pipelines.preparation import PreparedFrame
 from pipelines.tracking import ShotTracker
 
@@ -86,7 +87,7 @@ class ShotSplitter:
         if self._ended is not None and found.last >= self._current.observations[0].frame:
             yield from self._let_go()
         old = self._ended or self._current
-        if found.last < old.observations[0].frame:
+        if found.last < old.observations[0].frame or _spanned(old, found):
             return
         first = max(found.first, self._kept[0].frame)
         self.graphics |= dict.fromkeys(range(found.last + 1, first), found.kind)
@@ -177,6 +178,19 @@ def _motion_of(tracker: ShotTracker, frame: int) -> NDArray[np.float64] | None:
             return None
         return fit.H_dst_src
     return None
+
+
+def _spanned(tracker: ShotTracker, found: EditFound) -> bool:
+    """Whether one verified pair joins a picture before the edit to one after it: then both show the same view.
+
+    Players who fill the picture look like an edit to small pictures; the ground between them still registers."""
+    return any(
+        fit.status == PairStatus.OK
+        and fit.route != "composed"
+        and fit.src <= found.last
+        and fit.dst >= found.first
+        for fit in tracker.fits
+    )
 
 
 def _drop(tracker: ShotTracker) -> None:

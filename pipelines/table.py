@@ -12,12 +12,10 @@ from calib import rotation
 from calib.records import Level, Solution, Verdict
 from mosaic.coords import normalise_homography
 from mosaic.records import PairFit
+from pipelines.links import contradicted_frames
 from pipelines.records import CameraTable
 
 WEAK_SIGMA = 0.05  # f_std_px / f_px above which a frame is 'weak' (product.md)
-# rms residual of a frame's edges beyond which its camera contradicts its pictures: px, and share of the width.
-MISFIT_PX = 2.0
-MISFIT_W = 0.004
 ZOOM_FLOOR_PX = 0.1
 INTERPOLATED_INFLATION = 3.0  # error bars of a bridged frame against its neighbours'
 
@@ -55,7 +53,7 @@ def shot_rows(
     """
     n = len(facts)
     width = solution.lens.size_px[0]
-    misfit = solution.rms_px > max(MISFIT_PX, MISFIT_W * width)
+    misfit = contradicted_frames(solution)
     row_of = {
         int(f): i for i, f in enumerate(solution.frames) if np.isfinite(solution.log_f[i]) and not misfit[i]
     }
