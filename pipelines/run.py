@@ -38,11 +38,11 @@ from pipelines.shot_files import thumbnails, write_shot
 from pipelines.shots import ShotSplitter, TrackedShot
 from pipelines.table import FrameFacts, blank_rows, concatenate
 from pipelines.tracking import ShotTracker, selection_of
+from pipelines.watching import OverlayWatch
 
 log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int | None], None]
-MASK_EVERY = 25  # frames between two looks for fixed graphics: a look costs as much as registering two frames
 PACKAGES = ("av", "kornia", "numba", "numpy", "opencv-contrib-python-headless", "scipy", "tifffile", "torch")
 
 
@@ -152,18 +152,17 @@ def _first_pass(job: _Job) -> None:
     def follow(frame: Frame, look: Future[PreparedFrame]) -> None:
         with job.timings.measure("register"):
             done = list(splitter.push(look.result()))
-        if job.overlays is not None:
+        if watch is not None:
             with job.timings.measure("overlays"):
-                motion = splitter.last_motion_px
-                if np.isfinite(motion):
-                    job.overlays.update(frame.gray, motion)
-                if count % MASK_EVERY == 0:
-                    job.mask = job.overlays.mask()
+                job.mask = watch.push(count, frame.gray, splitter.last_motion_px, job.mask)
+                if done:
+                    watch.settle()
         for shot in done:
             _finish(job, shot)
         job.progress("first pass", count, expected)
 
-    with ThreadPoolExecutor(1) as preparing:
+    with ThreadPoolExecutor(1) as preparing, ThreadPoolExecutor(1) as watching:
+        watch = OverlayWatch(job.overlays, watching) if job.overlays is not None else None
         ahead: tuple[Frame, Future[PreparedFrame]] | None = None
         while True:
             with job.timings.measure("decode"):
@@ -184,6 +183,8 @@ def _first_pass(job: _Job) -> None:
             if prepared is None:
                 break
             ahead = prepared
+        if watch is not None:
+            watch.settle()
     if count == 0:
         raise InputError(job.clip.facts.path, "no picture in the chosen range", "lower run.start_frame")
     for shot in splitter.finish():
