@@ -23,13 +23,13 @@ MISFIT_PX, MISFIT_TIMES, MISFIT_ANY_PX = 1.0, 4.0, 5.0
 
 
 def contradicted_frames(solution: Solution) -> NDArray[np.bool_]:
-    """(n,) bool: frames whose own pairs do not fit their camera."""
+    """(n,) bool: frames whose own pairs do not fit their camera; never the reference, which all are related to."""
     px = solution.lens.size_px[0] / 1280
     known = solution.rms_px[np.isfinite(solution.rms_px)]
     usual = float(np.median(known)) if len(known) else np.inf
     limit = min(max(MISFIT_PX * px, MISFIT_TIMES * usual), MISFIT_ANY_PX * px)
     with np.errstate(invalid="ignore"):
-        return np.asarray(solution.rms_px > limit)
+        return np.asarray((solution.rms_px > limit) & (solution.frames != solution.reference))
 
 
 def verified_frames(frames: NDArray[np.int64], fits: Iterable[PairFit], reference: int) -> NDArray[np.bool_]:
