@@ -1,4 +1,4 @@
-"""The parallax of the entrance pupil in a shot: estimated from its keyframes, taken out of what frames measured.
+"""The parallax of the entrance pupil in a shot: estimated from its keyframes and taken out of what they measured.
 
 Keyframes are registered again with the lens that is left when the parallax is out, because a pair measures a little
 of the lens that it was registered through. What the parallax is and how it is found: `calib.parallax`, `calib.pupil`.
@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.pupil import PupilFit, PupilOptions, fit_pupil, without_parallax
+from calib.pupil import PupilFit, PupilOptions, fit_pupil
 from calib.records import HomographyGraph, Solution
 from calib.refine import refine
 from mosaic.records import PairFit
@@ -33,11 +33,9 @@ def with_pupil(result: KeyframeResult, register: Callable[[Solution], list[PairF
     if not (result.options.distortion and np.isfinite(result.solution.log_f).sum() >= 2):
         return result  # the plain model of a torn graph claims nothing, so there is nothing to correct
     found = _fit(result.graph, result.solution, result)
-    result = replace(result, pupil=found)
-    for _ in range(MAX_ROUNDS):
-        if not found.accepted:
-            break
-        result = replace(result, solution=found.solution, graph=found.graph, pupil=found)
+    # Not accepted: its solution and graph are those handed in.
+    result = replace(result, solution=found.solution, graph=found.graph, pupil=found)
+    for _ in range(MAX_ROUNDS if found.accepted else 0):
         fits = register(found.solution)
         graph = homography_graph(found.solution.frames, fits, result.graph.size_px)
         options = replace(result.options, reference=found.solution.reference)
@@ -57,10 +55,3 @@ def with_pupil(result: KeyframeResult, register: Callable[[Solution], list[PairF
 
 def _fit(graph: HomographyGraph, solution: Solution, result: KeyframeResult) -> PupilFit:
     return fit_pupil(graph, solution, PupilOptions(refine=result.options))
-
-
-def measured_without(graph: HomographyGraph, solution: Solution, pupil: PupilFit | None) -> HomographyGraph:
-    """A graph's measurements without the parallax of an accepted pupil; solution: cameras of its frames."""
-    if pupil is None or pupil.parallax is None:
-        return graph
-    return without_parallax(graph, solution, pupil.parallax)

@@ -19,6 +19,7 @@ from calib.gates import GateOptions, judge
 from calib.level import level
 from calib.parallax import Parallax
 from calib.poses import solve_poses
+from calib.pupil import without_parallax
 from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
 from mosaic.composite import Panorama, composite
@@ -39,7 +40,7 @@ from pipelines.keyframe_graph import (
 )
 from pipelines.links import contradicted_frames, without_doubtful
 from pipelines.moving import MovingFinder
-from pipelines.pupil import measured_without, with_pupil
+from pipelines.pupil import with_pupil
 from pipelines.pupil_facts import pupil_facts
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
@@ -318,8 +319,8 @@ def _poses(tracker: ShotTracker, result: KeyframeResult, fits: Sequence[PairFit]
     between = [f for f in fits if not (f.src in tracker.keyframes and f.dst in tracker.keyframes)]
     graph = homography_graph(frames, between, tracker.size_px)
     solved = solve_poses(graph, held)
-    if result.pupil is not None and result.pupil.accepted:
-        solved = solve_poses(measured_without(graph, solved, result.pupil), held)
+    if result.parallax is not None:
+        solved = solve_poses(without_parallax(graph, solved, result.parallax), held)
     return _with_duplicates(solved, tracker)
 
 
