@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.cli_results import AsJson, print_json, refuse_settings
-from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError, OutputError
+from pipelines.csv_output import write_csv
+from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError
 
 if TYPE_CHECKING:
     from pipelines.pitch import Pitch
@@ -221,19 +221,4 @@ def _write(rows: Sequence[dict[str, Any]], columns: Sequence[str], path: Path | 
     plain = [
         {k: "" if v != v else (v if isinstance(v, int) else float(v)) for k, v in row.items()} for row in rows
     ]
-    if path is None:
-        writer = csv.DictWriter(sys.stdout, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(plain)
-        return
-    from pipelines.exports.whole_file import whole_file
-
-    try:
-        with whole_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.DictWriter(stream, columns, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(plain)
-    except OSError as error:
-        raise OutputError(
-            path, f"cannot be written ({error.strerror})", "choose another place with -o"
-        ) from None
+    write_csv(plain, columns, path)

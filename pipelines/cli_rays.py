@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,8 @@ import typer
 
 from pipelines.cli_results import AsJson, Out, print_json, refuse_settings
 from pipelines.csv_input import read_csv_rows
-from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError, OutputError
+from pipelines.csv_output import write_csv
+from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError
 
 if TYPE_CHECKING:
     from pipelines.records import CameraTable
@@ -63,7 +63,7 @@ def rays(
     if as_json:
         print_json({"exit_code": code, "points": rows})
     else:
-        _write(rows, path)
+        write_csv(rows, COLUMNS, path)
     return code
 
 
@@ -135,20 +135,3 @@ def _why(table: CameraTable, unknown: Sequence[dict[str, Any]], n: int) -> str:
         words = reason_words(reason)[0] if reason else STATUS_SIGNS.get(status, ("", "no camera"))[1]
         cause = f"frame {frame} is {status or 'without a camera'}: {words}"
     return cause if n == 1 else f"{len(unknown)} of {n} points have no answer; first: {cause}"
-
-
-def _write(rows: Sequence[dict[str, Any]], path: Path | None) -> None:
-    if path is None:
-        csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n").writeheader()
-        csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n").writerows(rows)
-        return
-    from pipelines.exports.whole_file import whole_file
-
-    try:
-        with whole_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        cause = f"cannot be written ({error.strerror})"
-        raise OutputError(path, cause, "choose another place with -o") from None
