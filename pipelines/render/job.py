@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from pipelines.decode import Clip, Frame
 from pipelines.errors import InputError
 from pipelines.progress import Progress
-from pipelines.render.encode import Clock, clock_of
+from pipelines.render.encode import EncodeOptions, VideoWriter, clock_of, video_writer
 from pipelines.render.opened import OpenedRun
 
 
@@ -102,9 +103,20 @@ def pictures(
         raise InputError(clip.facts.path, cause, "it changed, or decodes differently here: run again")
 
 
-def output_clock(run: OpenedRun, rows: Sequence[int]) -> Clock:
-    """Times of the new pictures: those of the clip, from the first one on."""
-    return clock_of(run.table.pts_s[list(rows)], run.picture_fps)
+def writer_like(
+    run: OpenedRun, clip: Clip, rows: Sequence[int], path: Path, *, sound: bool, encode: EncodeOptions | None
+) -> AbstractContextManager[VideoWriter]:
+    """video_writer() for pictures of these rows as the clip has them: size, times, colour tags, its sound if wanted."""
+    return video_writer(
+        path,
+        size_px=run.size_px,
+        clock=clock_of(run.table.pts_s[list(rows)], run.picture_fps),
+        colour=clip.facts.colour,
+        pixel_aspect=clip.facts.pixel_aspect,
+        sound_of=clip.facts.path if sound else None,
+        sound_from_s=float(run.table.pts_s[rows[0]]),
+        options=encode,
+    )
 
 
 def stretches(run: OpenedRun, rows: Sequence[int]) -> tuple[Stretch, ...]:

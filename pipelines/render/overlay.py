@@ -19,9 +19,9 @@ from pipelines.exports.panorama_json import read_surface
 from pipelines.pitch import Pitch
 from pipelines.progress import Progress, silent
 from pipelines.rays import pan_tilt_to_ray
-from pipelines.render.encode import EncodeOptions, video_writer
+from pipelines.render.encode import EncodeOptions
 from pipelines.render.inlay import Inlay, draw, place, read_picture
-from pipelines.render.job import Rendered, chosen_rows, output_clock, pictures, stretches
+from pipelines.render.job import Rendered, chosen_rows, pictures, stretches, writer_like
 from pipelines.render.matte import MatteOptions, difference, front_matte
 from pipelines.render.opened import OpenedRun, one_shot, open_its_clip
 from pipelines.render.plate import Plate, fit_light, read_plate
@@ -82,16 +82,7 @@ def overlay(
     covered = unknown = 0.0
     with (
         open_its_clip(run, options.clip) as clip,
-        video_writer(
-            path,
-            size_px=run.size_px,
-            clock=output_clock(run, rows),
-            colour=clip.facts.colour,
-            pixel_aspect=clip.facts.pixel_aspect,
-            sound_of=clip.facts.path if options.sound else None,
-            sound_from_s=float(run.table.pts_s[rows[0]]),
-            options=encode,
-        ) as writer,
+        writer_like(run, clip, rows, path, sound=options.sound, encode=encode) as writer,
     ):
         for row, picture in pictures(run, clip, rows, progress, "overlay"):
             if row in views:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.progress import Progress, silent
-from pipelines.render.encode import EncodeOptions, video_writer
-from pipelines.render.job import Rendered, chosen_rows, output_clock, pictures, stretches
+from pipelines.render.encode import EncodeOptions
+from pipelines.render.job import Rendered, chosen_rows, pictures, stretches, writer_like
 from pipelines.render.opened import OpenedRun, open_its_clip
 from pipelines.render.paths import smoothed
 from pipelines.render.plate import Plate, fit_light, read_plate
@@ -76,16 +76,7 @@ def stabilise(
     unseen = 0.0
     with (
         open_its_clip(run, options.clip) as clip,
-        video_writer(
-            path,
-            size_px=run.size_px,
-            clock=output_clock(run, rows),
-            colour=clip.facts.colour,
-            pixel_aspect=clip.facts.pixel_aspect,
-            sound_of=clip.facts.path if options.sound else None,
-            sound_from_s=float(run.table.pts_s[rows[0]]),
-            options=encode,
-        ) as writer,
+        writer_like(run, clip, rows, path, sound=options.sound, encode=encode) as writer,
     ):
         for row, picture in pictures(run, clip, rows, progress, "stabilised"):
             if row in sources:
