@@ -79,6 +79,7 @@ class FrameStore:
         self._trust_known: dict[bytes, int] = {}  # digest -> offset: a static overlay is stored once
         self._trust_kept: tuple[int, NDArray[np.uint8]] | None = None
         self._same: _Trust | None = None  # of the frame before: masks seldom change
+        self._small: dict[int, tuple[int, int]] = {}  # frame -> offset and block side of its small picture
         self._coarse: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
         self._cache: OrderedDict[tuple[int, int], StoredFrame] = OrderedDict()
         self._cached_bytes = 0
@@ -106,12 +107,14 @@ class FrameStore:
         rgb: NDArray[np.uint8],
         mask: NDArray[np.bool_] | None = None,
         trust: NDArray[np.uint8] | NDArray[np.floating] | None = None,
+        small: NDArray[np.uint8] | None = None,
     ) -> None:
         """Store one frame.
 
         rgb (h, w, 3) uint8. mask (h, w) bool, True = usable scene. trust (h, w): how sure it is that a pixel shows
-        the scene at rest, float 0..1 or uint8 0..255; low where something moves. Raises ValueError on a wrong
-        shape or dtype, or a frame that is already there.
+        the scene at rest, float 0..1 or uint8 0..255; low where something moves. small (h // s, w // s, 3): its mean
+        over blocks of s x s px, if the caller has it (any s of 2 or more): smaller pictures are then made from this
+        one. Raises ValueError on a wrong shape or dtype, or a frame that is already there.
         """
         width, height = self.size_px
         if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
@@ -120,7 +123,15 @@ class FrameStore:
             raise ValueError(f"frame {frame} is stored already")
         coarse_size = (width // COARSE, height // COARSE)
         cut = np.s_[: coarse_size[1] * COARSE, : coarse_size[0] * COARSE]
-        coarse = cv2.resize(rgb[cut], coarse_size, interpolation=cv2.INTER_AREA)
+        shrink = 1
+        if small is not None:
+            shrink = round(width / small.shape[1])
+            if small.shape != (height // shrink, width // shrink, 3) or small.dtype != np.uint8 or shrink < 2:
+                raise ValueError(f"small is {small.dtype} {small.shape}, of a frame {(height, width, 3)}")
+        coarse = self._mean_over_blocks(rgb if small is None else small, shrink, COARSE)
+        if coarse is None:
+            coarse = self._mean_over_blocks(rgb, 1, COARSE)
+        assert coarse is not None
         if trust is not None or self._same is None or not _equal(self._same.mask, mask):
             plane = self._trust_plane(mask, trust)
             same = _Trust(mask=None if mask is None else mask.copy(), offset=None, coarse=None)
@@ -133,8 +144,22 @@ class FrameStore:
         if same.offset is not None:
             self._trust_of[frame] = same.offset
         coarse_trust = np.full(coarse_size[::-1], 255, np.uint8) if same.coarse is None else same.coarse
-        self._coarse[frame] = (np.asarray(coarse, dtype=np.uint8), coarse_trust)
+        self._coarse[frame] = (coarse, coarse_trust)
         self._offset[frame] = self._append(np.ascontiguousarray(rgb))
+        if small is not None:
+            self._small[frame] = (self._append(np.ascontiguousarray(small)), shrink)
+
+    def _mean_over_blocks(
+        self, picture: NDArray[np.uint8], shrink: int, wanted: int
+    ) -> NDArray[np.uint8] | None:
+        """A frame's mean over blocks of `wanted` px, from its picture of blocks of `shrink`; None: their edges do not
+        meet."""
+        size = (self.size_px[0] // wanted, self.size_px[1] // wanted)
+        width, height = (n * wanted for n in size)
+        if width % shrink or height % shrink or wanted < shrink:
+            return None
+        cut = picture[: height // shrink, : width // shrink]
+        return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def put_still(self, frame: int, plane: NDArray[np.uint8]) -> None:
         """How sure it is that a frame's pixels are at rest, found later than its picture: (h, w) uint8 at any
@@ -250,19 +275,28 @@ class FrameStore:
 
     def _load(self, frame: int, shrink: int) -> StoredFrame:
         width, height = self.size_px
-        rgb = self._read(self._offset[frame], (height, width, 3))
         trust = self._read_trust(frame)
-        if shrink > 1:
-            small = (width // shrink, height // shrink)
-            cut = np.s_[: small[1] * shrink, : small[0] * shrink]
-            whole = rgb
-            rgb = np.asarray(cv2.resize(whole[cut], small, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-            with self._lock:
-                if len(self._spare) < 2:
-                    self._spare.append(whole)
-            if trust is not None:
-                trust = block_minimum(trust[cut], shrink)
-        return StoredFrame(rgb=rgb, trust=trust, shrink=shrink)
+        if shrink == 1:
+            return StoredFrame(rgb=self._read(self._offset[frame], (height, width, 3)), trust=trust)
+        if trust is not None:
+            trust = block_minimum(trust[: height // shrink * shrink, : width // shrink * shrink], shrink)
+        return StoredFrame(rgb=self._reduced(frame, shrink), trust=trust, shrink=shrink)
+
+    def _reduced(self, frame: int, shrink: int) -> NDArray[np.uint8]:
+        width, height = self.size_px
+        if frame in self._small:
+            offset, side = self._small[frame]
+            small = self._read(offset, (height // side, width // side, 3))
+            reduced = self._mean_over_blocks(small, side, shrink)
+            if reduced is not None:
+                return reduced
+        whole = self._read(self._offset[frame], (height, width, 3))
+        reduced = self._mean_over_blocks(whole, 1, shrink)
+        assert reduced is not None
+        with self._lock:
+            if len(self._spare) < 2:
+                self._spare.append(whole)
+        return reduced
 
     def _read_trust(self, frame: int) -> NDArray[np.uint8] | None:
         offset = self._trust_of.get(frame)

@@ -92,60 +92,72 @@ def local_contrast(rgb: Plane) -> NDArray[np.float32]:
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _apart(a, b, i, j):  # type: ignore[no-untyped-def]
+def _apart(r0, g0, b0, r1, g1, b1):  # type: ignore[no-untyped-def]
     """Mean difference of the channels; the largest counts twice (white on green differs in red and blue only)."""
-    d0 = abs(np.int32(a[i, j, 0]) - np.int32(b[i, j, 0]))
-    d1 = abs(np.int32(a[i, j, 1]) - np.int32(b[i, j, 1]))
-    d2 = abs(np.int32(a[i, j, 2]) - np.int32(b[i, j, 2]))
-    return np.float32(0.25) * np.float32(d0 + d1 + d2 + max(d0, d1, d2))
+    d0 = abs(np.float32(r0) - np.float32(r1))
+    d1 = abs(np.float32(g0) - np.float32(g1))
+    d2 = abs(np.float32(b0) - np.float32(b1))
+    return np.float32(0.25) * (d0 + d1 + d2 + max(d0, max(d1, d2)))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _judge(now, others, seen, frames, weight, allowed, alternative, verdict):  # type: ignore[no-untyped-def]
     """Per pixel: 2 = moves, 1 = nobody confirms it, 0 = at rest or nothing known.
 
-    others (k, h, w, 3) and seen (k, h, w): neighbours on the picture's pixels; frames, weight (k,); allowed (h, w).
+    now (3, h, w), others (k, 3, h, w) and seen (k, h, w): neighbours on the picture's pixels; frames, weight (k,);
+    allowed (h, w). Planes, not pixels: so the first loop, which settles nearly all of a picture, runs in vectors.
     """
     n, height, width = seen.shape
     off = np.empty(n, np.int32)
+    own, against = np.empty(width, np.float32), np.empty(width, np.float32)
+    sides = np.empty((2, width), np.float32)
+    zero = np.float32(0)
     for i in range(height):
+        own[:] = 0
+        against[:] = 0
+        sides[:] = 0
+        limit = allowed[i]
+        red, green, blue = now[0, i], now[1, i], now[2, i]
+        for k in range(n):
+            share = weight[k]
+            side = sides[0 if frames[k] < 0 else 1]
+            known, r, g, b = seen[k, i], others[k, 0, i], others[k, 1, i], others[k, 2, i]
+            for j in range(width):
+                d = _apart(red[j], green[j], blue[j], r[j], g[j], b[j])
+                counts = np.float32(known[j])
+                away = counts if d > np.float32(1.5) * limit[j] else zero
+                own[j] += share * (counts if d <= limit[j] else zero)
+                against[j] += share * away
+                side[j] += away
         for j in range(width):
             verdict[i, j] = 0
-            limit = allowed[i, j]
-            own, total, n_off, before, after = np.float32(0), np.float32(0), 0, 0, 0
-            for k in range(n):
-                if not seen[k, i, j]:
-                    continue
-                total += weight[k]
-                d = _apart(now, others[k], i, j)
-                if d <= limit:
-                    own += weight[k]
-                elif d > np.float32(1.5) * limit:
-                    off[n_off] = k
-                    n_off += 1
-                    before += frames[k] < 0
-                    after += frames[k] > 0
-            if before == 0 or after == 0:
+            if sides[0, j] == 0 or sides[1, j] == 0:
                 continue
-            best, against = np.float32(0), np.float32(0)
-            for a in range(n_off):
-                against += weight[off[a]]
-            if own > 0 and not against > alternative * own:
+            if own[j] > 0 and not against[j] > alternative * own[j]:
                 continue  # even if all of them agreed
+            n_off = 0
+            for k in range(n):
+                if seen[k, i, j]:
+                    o = others[k, :, i, j]
+                    if _apart(red[j], green[j], blue[j], o[0], o[1], o[2]) > np.float32(1.5) * limit[j]:
+                        off[n_off] = k
+                        n_off += 1
+            best = zero
             for a in range(n_off):
-                ka = off[a]
-                support, earlier, later = np.float32(0), False, False
+                support, earlier, later = zero, False, False
+                mine = others[off[a], :, i, j]
                 for b in range(n_off):
                     kb = off[b]
-                    if _apart(others[ka], others[kb], i, j) <= limit:
+                    o = others[kb, :, i, j]
+                    if _apart(mine[0], mine[1], mine[2], o[0], o[1], o[2]) <= limit[j]:
                         support += weight[kb]
                         earlier = earlier or frames[kb] < 0
                         later = later or frames[kb] > 0
                 if earlier and later:
                     best = max(best, support)
-            if best > alternative * own:
+            if best > alternative * own[j]:
                 verdict[i, j] = 2
-            elif own == 0:
+            elif own[j] == 0:
                 verdict[i, j] = 1
 
 
@@ -162,7 +174,7 @@ def still_plane(now: Plane, neighbours: Sequence[Neighbour], options: MotionOpti
     weight = (0.35 + 0.65 * np.minimum(np.abs(frames) / options.slow_frames, 1.0)).astype(np.float32)
     allowed = tolerance(now, options)
     verdict = np.empty((height, width), np.uint8)
-    _judge(now, others, seen, frames, weight, allowed, np.float32(options.alternative), verdict)
+    _judge(_planes(now), others, seen, frames, weight, allowed, np.float32(options.alternative), verdict)
     core, body = _solid((verdict == 2).astype(np.uint8), options)
     still = np.where(verdict == 1, np.uint8(options.doubtful), np.uint8(255))
     still[body > 0] = options.halo
@@ -173,49 +185,74 @@ def still_plane(now: Plane, neighbours: Sequence[Neighbour], options: MotionOpti
 def align_neighbours(
     now: Plane, neighbours: Sequence[Neighbour]
 ) -> tuple[Plane, NDArray[np.bool_], NDArray[np.float32]]:
-    """Neighbours on the pixels of `now`, levelled to its exposure: (k, h, w, 3), seen (k, h, w), frames (k,)."""
+    """Neighbours on the pixels of `now`, levelled to its exposure: planes (k, 3, h, w), seen (k, h, w), frames (k,)."""
     height, width = now.shape[:2]
-    others = np.empty((len(neighbours), height, width, 3), np.uint8)
+    others = np.empty((len(neighbours), 3, height, width), np.uint8)
     seen = np.empty((len(neighbours), height, width), bool)
     frames = np.array([n.frames for n in neighbours], np.float32)
     sparse = np.s_[::6, ::6]
-    few = np.ascontiguousarray(now[sparse])
-    some, usable = np.empty_like(few), np.empty(few.shape[:2], bool)
+    few = _planes(now[sparse])
+    some, usable = np.empty_like(few), np.empty(few.shape[1:], bool)
+    levels = np.arange(256, dtype=np.float32)
+    as_it_is = np.tile(levels.astype(np.uint8), (3, 1))
     for k, neighbour in enumerate(neighbours):
         at = neighbour.at_px
-        _warp(neighbour.rgb, np.ascontiguousarray(at[sparse]), np.ones(3, np.float32), some, usable)
-        gain = np.ones(3, np.float32)
+        packed = np.asarray(cv2.cvtColor(neighbour.rgb, cv2.COLOR_RGB2RGBA)).view(np.uint32)[..., 0]
+        _warp(packed, np.ascontiguousarray(at[sparse]), as_it_is, some, usable)
+        table = as_it_is
         if usable.any():
-            ratio = (few[usable].astype(np.float32) + 4.0) / (some[usable].astype(np.float32) + 4.0)
-            gain = np.clip(np.median(ratio.T, axis=1), 0.5, 2.0).astype(np.float32)
-        _warp(neighbour.rgb, at, gain, others[k], seen[k])
+            ratio = (few[:, usable].astype(np.float32) + 4.0) / (some[:, usable].astype(np.float32) + 4.0)
+            gain = np.clip(np.median(ratio, axis=1), 0.5, 2.0).astype(np.float32)
+            table = np.minimum(gain[:, None] * levels + 0.5, 255).astype(np.uint8)
+        _warp(packed, at, table, others[k], seen[k])
     return others, seen, frames
 
 
+def _planes(rgb: Plane) -> Plane:
+    """(h, w, 3) to (3, h, w)."""
+    return np.ascontiguousarray(rgb.transpose(2, 0, 1))
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _warp(rgb, at, gain, out, seen):  # type: ignore[no-untyped-def]
-    """rgb (H, W, 3) at the places at (h, w, 2), times gain (3,), bilinear, into out (h, w, 3) and seen (h, w)."""
-    height, width = rgb.shape[:2]
+def _warp(packed, at, table, out, seen):  # type: ignore[no-untyped-def]
+    """packed (H, W) uint32 RGBA at the places at (h, w, 2), bilinear, through table (3, 256): out (3, h, w), seen.
+
+    Fixed point, a 256th of a pixel: red and blue are weighted in one multiplication, 16 bits each."""
+    height, width = packed.shape
+    flat = packed.reshape(-1)
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
-    one, top, rounding = np.float32(1), np.float32(255), np.float32(0.5)
-    flat, stride = rgb.reshape(-1), 3 * width
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
+    scale, two, eight = np.float32(256), np.uint64(0x00FF00FF), np.uint64(8)
+    one, low = np.uint64(1), np.uint64(0xFF)
+    for i in range(seen.shape[0]):
+        red, green, blue = out[0, i], out[1, i], out[2, i]
+        for j in range(seen.shape[1]):
             x, y = at[i, j, 0], at[i, j, 1]
             inside = (x >= 0) and (x <= last_x) and (y >= 0) and (y <= last_y)
             seen[i, j] = inside
             if not inside:
-                out[i, j, 0], out[i, j, 1], out[i, j, 2] = 0, 0, 0
+                red[j], green[j], blue[j] = 0, 0, 0
                 continue
-            xi, yi = min(int(x), width - 2), min(int(y), height - 2)
-            u, v = x - np.float32(xi), y - np.float32(yi)
-            k00, k01, k10, k11 = (one - u) * (one - v), u * (one - v), (one - u) * v, u * v
-            for c in range(3):
-                p = np.uintp(yi * stride + 3 * xi + c)
-                q = p + np.uintp(stride)
-                upper = k00 * np.float32(flat[p]) + k01 * np.float32(flat[p + np.uintp(3)])
-                lower = k10 * np.float32(flat[q]) + k11 * np.float32(flat[q + np.uintp(3)])
-                out[i, j, c] = np.uint8(min(gain[c] * (upper + lower) + rounding, top))
+            fine_x, fine_y = int(x * scale), int(y * scale)
+            xi, yi = min(fine_x >> 8, width - 2), min(fine_y >> 8, height - 2)
+            u, v = fine_x - (xi << 8), fine_y - (yi << 8)
+            k11 = (u * v + 128) >> 8
+            w11, w01, w10 = np.uint64(k11), np.uint64(u - k11), np.uint64(v - k11)
+            w00 = np.uint64(256 - u - v + k11)
+            p = np.uint64(yi * width + xi)
+            q = p + np.uint64(width)
+            p00, p01, p10, p11 = (
+                np.uint64(flat[p]),
+                np.uint64(flat[p + one]),
+                np.uint64(flat[q]),
+                np.uint64(flat[q + one]),
+            )
+            rb = (p00 & two) * w00 + (p01 & two) * w01 + (p10 & two) * w10 + (p11 & two) * w11
+            rb += np.uint64(0x00800080)
+            g = ((p00 >> eight) & low) * w00 + ((p01 >> eight) & low) * w01
+            g += ((p10 >> eight) & low) * w10 + ((p11 >> eight) & low) * w11 + np.uint64(128)
+            red[j] = table[0, (rb >> eight) & low]
+            green[j] = table[1, g >> eight]
+            blue[j] = table[2, (rb >> np.uint64(24)) & low]
 
 
 def _solid(moves: Plane, options: MotionOptions) -> tuple[Plane, Plane]:
@@ -261,7 +298,8 @@ class ScreenFixed:
             return False
         moved, seen, _ = align_neighbours(now, [neighbour])
         allowed = tolerance(now, self.options)
-        as_it_is, as_moved = _difference(now, neighbour.rgb), _difference(now, moved[0])
+        here = _planes(now)
+        as_it_is, as_moved = _difference(here, _planes(neighbour.rgb)), _difference(here, moved[0])
         # Where the neighbour does not look, nothing says that the scene would have been different.
         stays = (as_it_is <= allowed) & (as_moved > 1.5 * allowed) & seen[0]
         goes = (as_it_is > 1.5 * allowed) & seen[0]
@@ -290,9 +328,9 @@ class ScreenFixed:
 
 @numba.njit(cache=True, nogil=True)
 def _difference(a, b):  # type: ignore[no-untyped-def]
-    """The measure of _apart for whole pictures."""
-    out = np.empty(a.shape[:2], np.float32)
-    for i in range(a.shape[0]):
-        for j in range(a.shape[1]):
-            out[i, j] = _apart(a, b, i, j)
+    """The measure of _apart for whole pictures (3, h, w)."""
+    out = np.empty(a.shape[1:], np.float32)
+    for i in range(a.shape[1]):
+        for j in range(a.shape[2]):
+            out[i, j] = _apart(a[0, i, j], a[1, i, j], a[2, i, j], b[0, i, j], b[1, i, j], b[2, i, j])
     return out

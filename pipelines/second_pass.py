@@ -54,9 +54,10 @@ def second_pass(
 
     def keep(frame: Frame) -> Small | None:
         picture = cache(frame.picture)  # a conversion, and both may ask for it
+        small = moving.reduce(frame.index, picture)
         if frame.index in planned:
-            store.put(frame.index, picture(), mask)
-        return moving.reduce(frame.index, picture)
+            store.put(frame.index, picture(), mask, small=None if small is None else small.rgb)
+        return small
 
     def judge(index: int, kept: Future[Small | None]) -> None:
         moving.push(index, kept.result())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -343,6 +344,27 @@ def test_a_picture_in_hand_is_not_overwritten_by_later_reads(tmp_path):
         assert [int(v.max()) for v in views] == [1, 5, 9, 13, 17]
 
 
+@pytest.mark.parametrize("side", [2, 4, 3])
+def test_smaller_pictures_come_from_the_one_that_was_given(tmp_path, side):
+    rng = np.random.default_rng(1)
+    smooth = cv2.GaussianBlur(rng.integers(0, 256, (100, 200, 3), dtype=np.uint8), (0, 0), 2)
+    small = cv2.resize(
+        smooth[: 100 // side * side, : 200 // side * side],
+        (200 // side, 100 // side),
+        interpolation=cv2.INTER_AREA,
+    )
+    with FrameStore(tmp_path, (200, 100)) as store:
+        store.put(0, smooth)
+        store.put(1, smooth, small=small)
+        for shrink in (2, 4, 6, 8):
+            plain, made = (store.get(k, shrink).rgb.astype(int) for k in (0, 1))
+            assert plain.shape == made.shape and np.abs(plain - made).max() <= (3 if shrink % side else 1)
+        coarse = [store.coarse(k)[0].astype(int) for k in (0, 1)]
+        assert np.abs(coarse[0] - coarse[1]).max() <= 1
+        store.put(2, smooth, small=255 - small)
+        assert np.abs(store.get(2, 4 * side).rgb.astype(int) - store.get(0, 4 * side).rgb).max() > 10
+
+
 def test_store_refuses_what_does_not_fit(tmp_path):
     with FrameStore(tmp_path, (96, 64)) as store:
         good = np.zeros((64, 96, 3), np.uint8)
@@ -355,6 +377,8 @@ def test_store_refuses_what_does_not_fit(tmp_path):
             store.put(2, good, np.ones((96, 64), bool))
         with pytest.raises(ValueError, match="trust"):
             store.put(2, good, None, np.ones((3, 3)))
+        with pytest.raises(ValueError, match="small"):
+            store.put(2, good, small=np.zeros((32, 40, 3), np.uint8))
         with pytest.raises(KeyError):
             store.get(2)
 
