@@ -18,13 +18,12 @@ from mosaic.coords import anchor_information, default_anchors, fit_homography_to
 from mosaic.flow import measure_flow
 from mosaic.level import LevelPair, Linearised, RegisterOptions
 from mosaic.photometric import estimate_gain
-from mosaic.pulled import PulledWarp
 from mosaic.pyramid import Pyramid
 from mosaic.records import FloatArray, FlowGrid, PairFit, PairStatus
 from mosaic.solve import newton_step, step_in_sigmas
 from mosaic.template import PreparedTemplate, mask_arguments
 from mosaic.verdict import alignment_score, pixel_information
-from mosaic.warp import ProjectiveFamily
+from mosaic.warp import WarpFamily
 
 __all__ = ["RegisterOptions", "align"]
 
@@ -53,11 +52,12 @@ def align(
     n_steps = 0
     pair = LevelPair(
         source, target, levels[0], 1.0, 0.0, masks, kernels.load(options.kernel),
-        source.family.pull if isinstance(source.family, PulledWarp) else None,
+        _asked(source.family, "pull"),
     )  # fmt: skip
     for index in levels:
         pair.index = index
-        pair.gain, pair.offset = _gain(pair, state)
+        if index in (levels[0], levels[-1]):  # from coarse values whatever the level: in between nothing is new
+            pair.gain, pair.offset = _gain(pair, state)
         coarsest = index == levels[0] and len(levels) > 1 and index >= 2
         stop = options.stop_sigmas if index == levels[-1] else options.stop_sigmas_coarse
         result = _align_level(pair, state, not coarsest, stop, options)
@@ -69,6 +69,13 @@ def align(
             return _failed(template.frame, dst, template.size_px, "diverged", route, n_steps), start
     state, steps, fine = _polish(pair, state, fine, options)
     return _judge(pair, state, fine, n_steps + steps, dst, route, options), state
+
+
+def _asked(family: WarpFamily, method: str) -> Any:
+    """A method that only some families have (PulledWarp, ProjectiveFamily), or None.
+
+    By name: asking a protocol takes .2 ms, longer than a small kernel."""
+    return getattr(family, method, None)
 
 
 def _gain(pair: LevelPair, state: Any) -> tuple[float, float]:
@@ -194,11 +201,11 @@ def _judge(
     if len(flow.cell) < 6:
         return _failed(template.frame, dst, template.size_px, "no_texture", route, n_steps, score=score)
     anchors = default_anchors(template.size_px)
-    family = pair.source.family
-    if isinstance(family, ProjectiveFamily):
+    homography = _asked(pair.source.family, "homography")
+    if homography is not None:
         # The pixels know the homography better than the grid does, whose cells all have a floor that is not noise
         # (measured at 1080p with 11 % players: corners .009 px against .09 px).
-        H = family.homography(state)
+        H = homography(state)
         info = pixel_information(pair, state, fine, anchors)
     else:
         start = _warp_homography(level.src_px, fine.dst)

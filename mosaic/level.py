@@ -68,8 +68,7 @@ class Linearised:
 class LevelPair:
     """A template's level and the target's, with gain, offset and masks as the kernel takes them.
 
-    pull: what the family knows of its parameters (pulled.py), asked once a pair: asking a protocol takes longer than a
-    small kernel.
+    pull: what the family knows of its parameters (pulled.py).
     """
 
     source: PreparedTemplate

@@ -8,7 +8,7 @@ a measurement of `std_px` at the side of the picture.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from mosaic.warp import WarpFamily
 N_WEAK = 4
 
 
-@runtime_checkable
 class PulledWarp(WarpFamily, Protocol):
     """A family that knows something of its own parameters before it sees a picture."""
 

@@ -6,7 +6,7 @@ The homography (8 parameters) lives here. Others (rotation + zoom through a lens
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numba as nb
 import numpy as np
@@ -37,7 +37,6 @@ class WarpFamily(Protocol):
         ...
 
 
-@runtime_checkable
 class ProjectiveFamily(WarpFamily, Protocol):
     """A family of homographies: what it aligned is the pair's homography, with the information of the pixels."""
 
