@@ -256,6 +256,14 @@ class ShotOptions(Section):
             "of a transition"
         ),
     )
+    max_frames: int = Field(
+        default=12000,
+        ge=250,
+        description=(
+            "pictures; a longer shot is divided, each part calibrated by itself: memory grows by 25 KiB per "
+            "picture of a shot"
+        ),
+    )
 
 
 class PanoramaOptions(Section):

@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 
@@ -42,6 +42,7 @@ from pipelines.watching import OverlayWatch
 
 log = logging.getLogger(__name__)
 
+DIVIDED = "the view goes on in the next shot: it has more pictures than shots.max_frames"
 Progress = Callable[[str, int, int | None], None]
 PACKAGES = ("av", "kornia", "numba", "numpy", "opencv-contrib-python-headless", "scipy", "tifffile", "torch")
 
@@ -144,7 +145,9 @@ def _first_pass(job: _Job) -> None:
         job.images[id(tracker)] = tracker.images
         return tracker
 
-    splitter = ShotSplitter(new_tracker, config.shots.bridge_frames, graphics=job.graphics)
+    splitter = ShotSplitter(
+        new_tracker, config.shots.bridge_frames, max_frames=config.shots.max_frames, graphics=job.graphics
+    )
     frames = _selected(job.clip, config)
     expected = job.clip.facts.n_frames_header if config.run.max_frames is None else config.run.max_frames
     count = 0
@@ -238,6 +241,8 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
         )  # fmt: skip
         with solved.timings.measure("write"):
             record = write_shot(job.folder, index, tracker, solved, job.config)
+            if tracked.end == "length":
+                record = replace(record, warnings=(*record.warnings, DIVIDED))
         rows = solved.rows
         for stage, seconds in solved.timings.seconds.items():
             job.timings.seconds[stage] = job.timings.seconds.get(stage, 0.0) + seconds

@@ -29,8 +29,9 @@ KEPT = LAG + 6  # frames from which a new shot can begin again; 3.5 MB each at 1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedShot:
-    """A finished shot of pass one: its tracker, and why it ended: 'cut', 'fade', 'transition', 'end' of the clip, or
-    'lost': registration broke off without an edit that would say why."""
+    """A finished shot of pass one: its tracker, and why it ended: 'cut', 'fade', 'transition', 'end' of the clip,
+    'length': divided because memory grows with a shot, or 'lost': registration broke off without an edit that would
+    say why."""
 
     tracker: ShotTracker
     end: str
@@ -48,11 +49,13 @@ class _Break:
 class ShotSplitter:
     """Feeds frames to trackers and hands out shots as they are decided. `new_tracker` makes an empty tracker.
 
-    graphics: frames of gradual edits, which belong to no shot, and what they are ('fade', 'transition').
+    max_frames: of a shot; a longer one goes on as the next. graphics: frames of gradual edits, which belong to no shot,
+    and what they are ('fade', 'transition').
     """
 
     new_tracker: Callable[[], ShotTracker]
     bridge_frames: int
+    max_frames: int | None = None
     graphics: dict[int, str] = field(default_factory=dict)
     _edits: EditFinder | None = None
     _kept: deque[PreparedFrame] = field(default_factory=lambda: deque(maxlen=KEPT))
@@ -74,6 +77,7 @@ class ShotSplitter:
     def push(self, look: PreparedFrame) -> Iterator[TrackedShot]:
         """Take the next frame; yields shots that it completes."""
         self._kept.append(look)
+        yield from self._divide(look.frame)
         yield from self._follow(look)
         assert self._newest is not None
         if self._edits is None:
@@ -100,6 +104,16 @@ class ShotSplitter:
         self._edits.begin(first)
         for kept in [k for k in self._kept if k.frame >= first]:
             yield from self._follow(kept)
+
+    def _divide(self, frame: int) -> Iterator[TrackedShot]:
+        """A shot as long as shots may be ends before this frame, if nothing about it is undecided."""
+        if self.max_frames is None or self._current is None or self._break or self._ended:
+            return
+        if len(self._current.observations) >= self.max_frames:
+            yield TrackedShot(tracker=self._current, end="length")
+            self._current = None
+            if self._edits is not None:
+                self._edits.begin(frame)
 
     def _let_go(self) -> Iterator[TrackedShot]:
         """No edit explains the break: the shot before it ended where registration was lost."""

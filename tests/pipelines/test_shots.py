@@ -1,0 +1,47 @@
+"""A shot longer than shots may be goes on as the next one, and no frame is lost between them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from pipelines.shots import ShotSplitter, TrackedShot
+from tests.mosaic.textures import as_uint8, picture
+
+
+class _Tracker:
+    """Follows every picture."""
+
+    def __init__(self) -> None:
+        self.observations: list[Any] = []
+        self.fits: list[Any] = []
+        self.keyframes: dict[int, Any] = {}
+        self.images = None
+        self.size_px = (320, 180)
+
+    def start(self, look: Any) -> None:
+        self.observations.append(SimpleNamespace(frame=look.frame, motion_px=0.0))
+
+    def step(self, look: Any, *, rescue: bool = True) -> bool:
+        self.start(look)
+        return True
+
+
+def _frames_of_shots(n_frames: int, max_frames: int | None) -> list[tuple[list[int], str]]:
+    splitter = ShotSplitter(_Tracker, bridge_frames=10, max_frames=max_frames)  # type: ignore[arg-type]
+    small = as_uint8(picture(1, size_px=(320, 180)))
+    shots: list[TrackedShot] = []
+    for frame in range(n_frames):
+        shots += splitter.push(SimpleNamespace(frame=frame, pts_s=frame / 25, small=small))  # type: ignore[arg-type]
+    shots += splitter.finish()
+    return [([o.frame for o in shot.tracker.observations], shot.end) for shot in shots]
+
+
+def test_a_long_shot_is_divided_and_every_frame_is_in_one_part():
+    parts = _frames_of_shots(70, 30)
+    assert [frame for frames, _ in parts for frame in frames] == list(range(70))
+    assert [(len(frames), end) for frames, end in parts] == [(30, "length"), (30, "length"), (10, "end")]
+
+
+def test_without_a_limit_it_is_one_shot():
+    assert [(len(frames), end) for frames, end in _frames_of_shots(70, None)] == [(70, "end")]
