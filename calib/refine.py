@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 # The loss scale is the fixed point of fit and median residual, so that it does not depend on where a fit began.
 MAX_LOOKS = 10
 THIN_ABOVE = 200_000  # points
+# Known directions of an edge: a frame's focal and rotation are four, and one more shows when they are wrong.
+LEAST_DIRECTIONS = 5
 WARM_DAMPING = 1e-7  # beside an optimum: full steps, and damping only where one fails
 
 
@@ -53,10 +55,10 @@ def refine(
         raise ValueError(f"reference frame {reference_frame} is not in the graph")
     everything = pack(graph)
     row = int(np.flatnonzero(frames == reference_frame)[0])
-    in_reach = linked_frames(everything, everything.dof.sum(1) >= 8, row)
+    in_reach = linked_frames(everything, everything.dof.sum(1) >= LEAST_DIRECTIONS, row)
     if in_reach.sum() < 2:
         return nothing(graph, priors, reference_frame, "no_edges")
-    inside = in_reach[everything.ia] & in_reach[everything.ib] & (everything.dof.sum(1) >= 8)
+    inside = in_reach[everything.ia] & in_reach[everything.ib] & (everything.dof.sum(1) >= LEAST_DIRECTIONS)
     if not in_reach.all():
         part = HomographyGraph(
             frames=frames[in_reach],

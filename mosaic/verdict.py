@@ -57,4 +57,7 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
     variance = max(kappa, fine.sigma**2)
     inverse = np.linalg.inv(N)
     covariance = J8 @ (variance * inverse + inverse @ common @ inverse) @ J8.T
+    # Anchors at the horizon of a wrong homography move by anything.
+    if not np.isfinite(covariance).all() or not np.linalg.cond(covariance) < 1e14:
+        return unknown
     return np.linalg.inv(covariance)

@@ -15,10 +15,13 @@ from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.rescue import small_gray
 from mosaic.template import SelectionOptions, Template, build_template
 
+SMALL_PX = 1280  # width below which a picture is small
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedFrame:
-    """A frame before registration. template: of the levels from 1 on, for the frame after it; small: see small_gray."""
+    """A frame before registration. template: of the levels from `finest_of` on, for the frame after it; small: see
+    small_gray."""
 
     frame: int
     pts_s: float
@@ -32,6 +35,13 @@ class PreparedFrame:
         return self.pyramid.levels[min(2, len(self.pyramid.levels) - 1)]
 
 
+def finest_of(size_px: tuple[int, int]) -> int:
+    """The finest level on which neighbours are registered: the half size suffices from 1280 px of width on.
+
+    At 480 px it does not: lines of the pitch are a pixel wide there, and players are not."""
+    return 1 if size_px[0] >= SMALL_PX else 0
+
+
 def prepare_frame(
     frame: int,
     pts_s: float,
@@ -43,7 +53,7 @@ def prepare_frame(
 ) -> PreparedFrame:
     """Pyramid, template and small picture of gray (h, w), uint8 or float32 0..255. mask (h, w): True = usable."""
     pyramid = build_pyramid(gray, n_levels=n_levels, mask=mask)
-    levels = tuple(range(1, len(pyramid.levels)))
+    levels = tuple(range(finest_of(pyramid.size_px), len(pyramid.levels)))
     return PreparedFrame(
         frame=frame,
         pts_s=pts_s,

@@ -22,19 +22,21 @@ from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid
 from mosaic.records import FlowGrid, PairFit, PairStatus
 from mosaic.rescue import match_features, phase_correlation
+from mosaic.rivals import better_of_rivals
 from mosaic.screen import WIDER, ScreenVotes, moves_more_widely, without_still
 from mosaic.template import PreparedTemplate, SelectionOptions, Template, prepare, with_level
 from mosaic.warp import HomographyFamily, WarpFamily
 from pipelines.bridge import CameraPose, RotationZoomFamily, edge_from_fit, pair_state, pose_from_state
 from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import KeyframeImages, distance_in_widths
-from pipelines.preparation import PreparedFrame
+from pipelines.preparation import PreparedFrame, finest_of
 
 log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 TRUST_SIGMA = 0.3  # relative focal error at which four parameters already beat eight
 FLASH_LOG_GAIN = 0.25  # of a pair of neighbours or of a keyframe: more is a flash, or an exposure on its way
+FADING_SCORE = 0.5  # of a good link to the keyframe: the next one may be doubtful (score_ok is .6)
 WEAK_CHAIN = 5  # frames without a direct link to the keyframe before a new keyframe is taken
 RESTING_PX, MOVING_PX = (
     0.5,
@@ -218,6 +220,10 @@ class ShotTracker:
                 levels=coarse,
                 route="still",
             )
+        fit, H_prev = better_of_rivals(
+            prepare(self._previous.template, family), pyramid, fit, H_prev, np.eye(3), levels=coarse,
+            options=self.register_options,
+        )  # fmt: skip
         fit, H_prev = self._beyond_graphics(
             family, pyramid, fit, H_prev, step, _displacement(step, self.size_px)[0]
         )
@@ -271,6 +277,10 @@ class ShotTracker:
             fit, state = align(
                 source, pyramid, pair_state(self._pose, self._pose), dst=frame, levels=coarse, route="still"
             )
+        fit, state = better_of_rivals(
+            source, pyramid, fit, state, pair_state(self._pose, self._pose), levels=coarse,
+            options=self.register_options,
+        )  # fmt: skip
         fit, state = self._beyond_graphics(
             family, pyramid, fit, state, pair_state(self._pose, predicted),
             self.size_px[0] * distance_in_widths(self._pose, predicted, self.size_px[0]),
@@ -393,8 +403,12 @@ class ShotTracker:
     def _needs_keyframe(self, fits: list[PairFit]) -> bool:
         """Far enough from the current keyframe. The first few come sooner: a short pan must not end with one.
 
-        A doubtful frame (flash, blur, a crowd of players) waits for a better one, up to twice the distance.
+        A doubtful frame (flash, blur, a crowd of players) waits for a better one, up to twice the distance; where a
+        link to the keyframe will soon be doubtful, as players cover what it saw, the last good one is taken.
         """
+        direct = next((f for f in fits if f.src == self._current), None)
+        if direct is not None and direct.status == PairStatus.OK and direct.score > FADING_SCORE:
+            return True
         moved, zoom = _displacement(self._H_previous_keyframe, self.size_px)
         share = min(1.0, len(self.keyframes) / 3.0)
         if any(f.status != PairStatus.OK or abs(np.log(f.gain)) > FLASH_LOG_GAIN for f in fits):
@@ -482,7 +496,8 @@ class ShotTracker:
     # -- bookkeeping -------------------------------------------------------------------------------------------
 
     def _coarse_levels(self, pyramid: Pyramid) -> tuple[int, ...]:
-        return tuple(range(len(pyramid.levels) - 1, 0, -1))
+        """Levels of a pair of neighbours: to the half size, in a small picture to the full one."""
+        return tuple(range(len(pyramid.levels) - 1, finest_of(self.size_px) - 1, -1))
 
     def _follow(self, fits: list[PairFit], estimate: CameraEstimate) -> None:
         if self.trusts_camera and np.isfinite(estimate.log_f):

@@ -1,0 +1,214 @@
+"""Is there another place where two pictures agree better? A coarse sweep over shifts around an alignment.
+
+Players whom the camera follows stand still in the picture while the ground runs through it, and lines repeat: the
+alignment of either is a true minimum, and the next frame, predicted from it, starts in it again. Pixels of one coarse
+level at whole shifts, truncated differences: cheap enough for every pair, and what most pixels say wins. What is found
+only starts the direct estimator, whose score decides. Not found: a rival that is turned or zoomed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaic.coords import to_level
+from mosaic.estimator import RegisterOptions, align
+from mosaic.pyramid import Pyramid
+from mosaic.records import FloatArray, PairFit, PairStatus
+from mosaic.template import PreparedTemplate
+from mosaic.warp import WarpFamily
+
+# px; the finest level at most this wide is swept: lines of a pitch are still seen there.
+LEVEL_WIDTH = 320
+N_PIXELS, LEAST_PIXELS = 500, 60  # of the template's at most and at least
+REACH = (0.3, 0.12)  # of the width and of the height: how far from the alignment
+STEP = 2  # px of the level between shifts looked at first
+TRUNCATED_GREY = 15.0  # a difference that says no more than that the place is another one
+LEAST_SEEN = 0.4  # share of the pixels that a shift must leave in the picture
+APART = 3  # steps between two minima
+# A minimum is tried where its mean truncated difference is below this times the alignment's own.
+AS_GOOD = 1.1
+SURE_SCORE = 0.1  # an alignment as good as this has no rival
+SAME_PLACE = 1.5  # px of the level: a minimum so near is the alignment's own
+# Above it the alignment may be at the right place and bent by what moves: once more from there.
+BENT_SCORE = 0.25
+CLEARLY = 0.9  # of the alignment's score: more than this is no reason to leave what was predicted
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Around:
+    """Minima of a sweep, lowest first. shifts_px: (k, 2) full px; costs: (k,) mean truncated grey differences."""
+
+    shifts_px: FloatArray
+    costs: FloatArray
+
+
+def level_of(target: Pyramid) -> int:
+    """The level that is swept: the finest below full size that is at most LEVEL_WIDTH wide."""
+    narrow = (i for i, lev in enumerate(target.levels) if i > 0 and lev.shape[1] <= LEVEL_WIDTH)
+    return next(narrow, len(target.levels) - 1)
+
+
+def look_around(
+    source: PreparedTemplate,
+    target: Pyramid,
+    state: Any,
+    *,
+    gain: float = 1.0,
+    offset: float = 0.0,
+    n_minima: int = 3,
+) -> Around:
+    """Shifts, relative to `state`, at which source's pixels agree best with target; none where texture lacks."""
+    seen = _placed(source, target, state, gain, offset)
+    if seen is None:
+        return Around(shifts_px=np.zeros((0, 2)), costs=np.zeros(0))
+    scale = target.scales[level_of(target)]
+    h, w = seen[0].shape
+    nx, ny = (int(share * size) // STEP for share, size in zip(REACH, (w, h), strict=True))
+    costs = _sweep(*seen, nx, ny, STEP, TRUNCATED_GREY, LEAST_SEEN)
+    shifts, found = [], []
+    for _ in range(n_minima):
+        j, i = (int(v) for v in np.unravel_index(int(np.argmin(costs)), costs.shape))
+        if not np.isfinite(costs[j, i]):
+            break
+        cost, dx, dy = _finest(*seen, (i - nx) * STEP, (j - ny) * STEP)
+        shifts.append([dx * scale[0], dy * scale[1]])
+        found.append(cost)
+        costs[max(0, j - APART) : j + APART + 1, max(0, i - APART) : i + APART + 1] = np.inf
+    return Around(shifts_px=np.array(shifts, float).reshape(-1, 2), costs=np.array(found, float))
+
+
+def cost_of(source: PreparedTemplate, target: Pyramid, state: Any, *, gain: float, offset: float) -> float:
+    """The sweep's measure at a state itself; inf where it cannot be taken."""
+    seen = _placed(source, target, state, gain, offset)
+    return np.inf if seen is None else _finest(*seen, 0, 0)[0]
+
+
+def better_of_rivals(
+    source: PreparedTemplate,
+    target: Pyramid,
+    fit: PairFit,
+    state: Any,
+    base: Any,
+    *,
+    levels: Sequence[int],
+    options: RegisterOptions | None = None,
+) -> tuple[PairFit, Any]:
+    """The fit, or a better one found from a rival shift of `base`.
+
+    base: a state that is right but for a shift; not the fit's own, whose shape a wrong minimum has bent. levels: those
+    of the fit, so that the scores compare. Returns (fit, state) as `align` does.
+    """
+    if fit.status == PairStatus.OK and fit.score < SURE_SCORE:
+        return fit, state
+    gain, offset = (fit.gain, fit.offset) if fit.usable else (1.0, 0.0)
+    around = look_around(source, target, base, gain=gain, offset=offset)
+    here = cost_of(source, target, state, gain=gain, offset=offset) if fit.usable else np.inf
+    swept = level_of(target)
+    # From the level of the sweep on: on coarser ones players are within reach again.
+    fine = [i for i in levels if i <= swept] or list(levels)
+    still = source.family.warp(base, source.prepared_wide)[0]
+    for shift, cost in zip(around.shifts_px, around.costs, strict=True):
+        if not cost < AS_GOOD * here:
+            continue
+        same_place = False
+        if fit.usable:
+            moved_px = np.nanmedian(source.family.warp(state, source.prepared_wide)[0] - still, axis=0)
+            same_place = bool(np.abs(moved_px - shift).max() <= SAME_PLACE * target.scales[swept][0])
+            if same_place and fit.score < BENT_SCORE:
+                continue
+        moved = shifted(source.family, base, source.prepared_wide, shift)
+        other, other_state = align(
+            source, target, moved, dst=fit.dst, levels=fine, options=options, route="rival"
+        )
+        better = other.score < (fit.score if same_place else CLEARLY * fit.score)
+        if other.usable and (better or not fit.usable):
+            fit, state = other, other_state
+    return fit, state
+
+
+def shifted(family: WarpFamily, state: Any, prepared: Any, shift_px: FloatArray) -> Any:
+    """The state of any family that moves the prepared points nearest to where `state` does, plus the shift (2,) px."""
+    where, _, _ = family.warp(state, prepared)
+    wanted = where + shift_px
+    for _ in range(4):
+        now, J, _ = family.warp(state, prepared)
+        away = wanted - now
+        good = np.isfinite(away).all(axis=1)
+        if good.sum() < 8:
+            return state
+        J_good = J[good].reshape(-1, J.shape[2]).astype(np.float64)
+        step = np.linalg.lstsq(J_good, away[good].ravel(), rcond=None)[0]
+        state = family.update(state, np.asarray(step, np.float64))
+    return state
+
+
+def _placed(
+    source: PreparedTemplate, target: Pyramid, state: Any, gain: float, offset: float
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]] | None:
+    """The level (h, w), NaN where masked; places of the template's pixels in it; their values in its light."""
+    index = level_of(target)
+    level = source.template.levels[index]
+    if level is None:
+        return None
+    stride = max(1, len(level.src_px) // N_PIXELS)
+    where, _, _ = source.family.warp(state, source.prepared[index])
+    at = to_level(where[::stride], target.scales[index])
+    good = np.isfinite(at).all(axis=1) & (np.abs(at) < 1e6).all(axis=1)
+    if good.sum() < LEAST_PIXELS:
+        return None
+    x, y = np.floor(at[good] + 0.5).astype(np.int64).T
+    values = (level.values[::stride][good] - np.float32(offset)) / np.float32(gain)
+    return _usable(target, index), np.ascontiguousarray(x), np.ascontiguousarray(y), values
+
+
+def _usable(target: Pyramid, index: int) -> NDArray[np.float32]:
+    """The level (h, w), NaN where it is masked."""
+    picture = np.asarray(target.levels[index], np.float32)
+    if target.mask is None:
+        return np.ascontiguousarray(picture)
+    picture = picture.copy()
+    h, w = picture.shape
+    mh, mw = target.mask.shape
+    rows, columns = (np.arange(h) * mh // h), (np.arange(w) * mw // w)
+    picture[target.mask[np.ix_(rows, columns)] == 0] = np.nan
+    return picture
+
+
+def _finest(picture: Any, x: Any, y: Any, values: Any, dx: int, dy: int) -> tuple[float, int, int]:
+    """(cost, dx, dy) of the best whole shift next to one of the sweep."""
+    costs = _sweep(picture, x + dx, y + dy, values, 1, 1, 1, TRUNCATED_GREY, LEAST_SEEN)
+    j, i = np.unravel_index(int(np.argmin(costs)), costs.shape)
+    return float(costs[j, i]), dx + int(i) - 1, dy + int(j) - 1
+
+
+@nb.njit(cache=True, nogil=True)
+def _sweep(picture, x, y, values, nx, ny, step, most, least_seen):  # type: ignore[no-untyped-def]
+    """Mean truncated difference (2 ny + 1, 2 nx + 1) of values (n,) at x + step i, y + step j; inf: hardly seen."""
+    h, w = picture.shape
+    n = len(x)
+    out = np.full((2 * ny + 1, 2 * nx + 1), np.inf)
+    for j in range(2 * ny + 1):
+        for i in range(2 * nx + 1):
+            dx = (i - nx) * step
+            dy = (j - ny) * step
+            total = 0.0
+            seen = 0
+            for k in range(n):
+                a = x[k] + dx
+                b = y[k] + dy
+                if a < 0 or a >= w or b < 0 or b >= h:
+                    continue
+                away = abs(picture[b, a] - values[k])
+                if not away < np.inf:
+                    continue
+                seen += 1
+                total += min(away, most)
+            if seen >= least_seen * n and seen > 0:
+                out[j, i] = total / seen
+    return out
