@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import DecodeOptions
 from pipelines.errors import InputError
+from pipelines.hdr import TRANSFERS, WIDE_PRIMARIES, needs_mapping
 from pipelines.picture import Picture
 from pipelines.pixels import gray_plane, quarter_turns, rgb_picture, yuv_matrix
 from pipelines.scan import LOOK, STEP, judge_scan
@@ -34,7 +35,6 @@ from pipelines.stills import IMAGE_SUFFIXES, list_images
 from pipelines.timing import PtsRepair, Timecode
 
 UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
-HDR = {16: "PQ (SMPTE ST 2084)", 18: "HLG (ARIB STD-B67)"}  # by FFmpeg's AVCOL_TRC
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -223,8 +223,14 @@ def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) ->
     if turns:
         warnings.append(f"rotated by {90 * turns} degrees counter-clockwise, as the file asks")
         aspect = aspect if turns % 2 == 0 or options.pixel_aspect else 1.0 / aspect
-    if (hdr := HDR.get(int(getattr(video, "color_trc", UNSPECIFIED)))) is not None:
-        warnings.append(f"{hdr}: grey and colours are the coded values, not tone-mapped: panoramas look flat")
+    if needs_mapping(video):
+        known = (
+            TRANSFERS.get(int(getattr(video, "color_trc", UNSPECIFIED)), ""),
+            WIDE_PRIMARIES.get(int(getattr(video, "color_primaries", UNSPECIFIED)), ""),
+        )
+        warnings.append(
+            f"{', '.join(filter(None, known))}: pictures are mapped to BT.709, highlights drawn in; grey stays as coded"
+        )
     stat = source.path.stat() if source.path.exists() else None
     timecode = source.timecode or _gop_timecode(video, source.fps)
     if timecode is not None and timecode.count == 0 and not options.accept_zero_timecode:
@@ -245,7 +251,7 @@ def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) ->
             "range": int(video.color_range),
             "primaries": int(getattr(video, "color_primaries", UNSPECIFIED)),
             "transfer": int(getattr(video, "color_trc", UNSPECIFIED)),
-            "transfer_name": HDR.get(int(getattr(video, "color_trc", UNSPECIFIED)), ""),
+            "transfer_name": TRANSFERS.get(int(getattr(video, "color_trc", UNSPECIFIED)), ""),
             "rgb_matrix": "none" if video.format.is_rgb else Colorspace(yuv_matrix(video)).name,
         },
         interlaced=interlaced,

@@ -9,6 +9,8 @@ import numpy as np
 from av.video.reformatter import Colorspace
 from numpy.typing import NDArray
 
+from pipelines.hdr import needs_mapping, to_bt709
+
 
 def gray_plane(video: av.VideoFrame, turns: int) -> NDArray[Any]:
     """(h, w) luma of a picture, turned upright, owned and read-only: uint8, or float32 0..255 above 8 bits."""
@@ -46,7 +48,9 @@ def gray_plane(video: av.VideoFrame, turns: int) -> NDArray[Any]:
 
 
 def rgb_picture(video: av.VideoFrame, turns: int) -> NDArray[np.uint8]:
-    """(h, w, 3) RGB of a picture, turned upright."""
+    """(h, w, 3) RGB of a picture, turned upright; HDR and wide gamuts as BT.709 shows them (hdr.py)."""
+    if needs_mapping(video):
+        return np.ascontiguousarray(np.rot90(to_bt709(video, yuv_matrix(video)), turns))
     if video.format.is_rgb or video.format.has_palette:
         rgb = video.to_ndarray(format="rgb24")
     else:

@@ -1,4 +1,4 @@
-"""panorama.jpg: for people. At most 16384 px wide; an equirectangular one carries GPano metadata.
+"""panorama.jpg: for people. At most 16384 px wide, tagged sRGB; an equirectangular one carries GPano metadata.
 
 GPano (Google's Photo Sphere XMP) knows the equirectangular projection only: for a cylinder or a plane it would lie,
 so they get none.
@@ -16,6 +16,7 @@ from PIL import Image
 
 from mosaic.composite import Panorama
 from mosaic.surface import Surface
+from pipelines.exports.srgb import srgb_profile
 from pipelines.exports.whole_file import whole_file
 
 MAX_WIDTH_PX = 16384
@@ -39,8 +40,9 @@ def write_panorama_jpeg(
     options = {"xmp": gpano_xmp(scaled)} if scaled.kind == "equirectangular" else {}
     with whole_file(path) as temporary:
         picture.save(
-            temporary, format="JPEG", quality=quality, subsampling=0 if quality >= 90 else 2, **options
-        )
+            temporary, format="JPEG", quality=quality, subsampling=0 if quality >= 90 else 2,
+            icc_profile=srgb_profile(), **options,
+        )  # fmt: skip
     panorama.release()
     return size
 

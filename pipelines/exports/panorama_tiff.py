@@ -1,4 +1,5 @@
-"""panorama.tif: full resolution, tiled, deflate, levels of half size in SubIFDs, RGBA, BigTIFF when large.
+"""panorama.tif: full resolution, tiled, deflate, levels of half size in SubIFDs, RGBA tagged sRGB, BigTIFF when
+large.
 
 tifffile takes one tile at a time; each level is the mean over 2 x 2 px of the one above, weighted by alpha, so that
 unseen black does not darken the border of what was seen.
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from mosaic.composite import Canvas, Panorama
 from pipelines.exports.panorama_jpeg import gpano_xmp
+from pipelines.exports.srgb import srgb_profile
 from pipelines.exports.whole_file import whole_file
 
 TILE_PX = 512
@@ -57,6 +59,7 @@ def write_panorama_tiff(
                 tile=(TILE_PX, TILE_PX), compression="zlib", compressionargs={"level": compression_level},
                 maxworkers=threads, subifds=n_levels - 1 if level == 0 else None, subfiletype=1 if level else 0,
                 extratags=extra if level == 0 else [], software="broadcast-mosaic", metadata=None,
+                iccprofile=srgb_profile() if level == 0 else None,
             )  # fmt: skip
             panorama.release()
             canvas.release()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -12,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
+from PIL import Image, ImageCms
 
 from mosaic.composite import Canvas, Panorama
 from mosaic.surface import KINDS, Surface, choose_surface
@@ -65,6 +66,16 @@ def test_tiff_is_tiled_deflated_and_exact(tmp_path):
     np.testing.assert_allclose(half[100, 150, :3], middle, atol=0.51)
     with Image.open(tmp_path / "panorama.tif") as picture:  # libtiff reads it too
         np.testing.assert_array_equal(np.asarray(picture), full)
+
+
+def test_tiff_and_jpeg_are_tagged_srgb(tmp_path):
+    panorama = panorama_on(SURFACE)
+    write_panorama_tiff(panorama, tmp_path / "panorama.tif")
+    write_panorama_jpeg(panorama, tmp_path / "panorama.jpg")
+    with tifffile.TiffFile(tmp_path / "panorama.tif") as tif, Image.open(tmp_path / "panorama.jpg") as jpeg:
+        tags = [tif.pages[0].iccprofile, jpeg.info["icc_profile"]]
+    for tag in tags:
+        assert "sRGB" in ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(tag)))
 
 
 def test_unseen_black_does_not_darken_the_reduced_levels(tmp_path):
