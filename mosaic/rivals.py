@@ -187,28 +187,40 @@ def _finest(picture: Any, x: Any, y: Any, values: Any, dx: int, dy: int) -> tupl
     return float(costs[j, i]), dx + int(i) - 1, dy + int(j) - 1
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _sweep(picture, x, y, values, nx, ny, step, most, least_seen):  # type: ignore[no-untyped-def]
     """Mean truncated difference (2 ny + 1, 2 nx + 1) of values (n,) at x + step i, y + step j; inf: hardly seen."""
     h, w = picture.shape
-    n = len(x)
-    out = np.full((2 * ny + 1, 2 * nx + 1), np.inf)
+    n, columns = len(x), 2 * nx + 1
+    far_x, far_y = nx * step, ny * step
+    # Columns that a step apart follow each other, and unseen ones all around: the inner loop runs in vectors (an eighth
+    # of the time of one pixel after the other).
+    width = (w + 4 * far_x) // step + 1
+    planes = np.full((step, h + 4 * far_y, width), np.nan, np.float32)
+    for s in range(step):
+        a = (s - 2 * far_x) % step  # the first column that falls into this plane
+        part = picture[:, a::step]
+        left = (a + 2 * far_x) // step
+        planes[s, 2 * far_y : 2 * far_y + h, left : left + part.shape[1]] = part
+    total = np.zeros((2 * ny + 1, columns), np.float32)
+    seen = np.zeros((2 * ny + 1, columns), np.float32)
+    top, one, zero = np.float32(most), np.float32(1), np.float32(0)
+    for k in range(n):
+        if x[k] < -far_x or x[k] >= w + far_x or y[k] < -far_y or y[k] >= h + far_y:
+            continue
+        value = np.float32(values[k])
+        first = x[k] + far_x
+        for j in range(2 * ny + 1):
+            row = planes[first % step, y[k] + far_y + j * step, first // step : first // step + columns]
+            sums, counts = total[j], seen[j]
+            for i in range(columns):
+                away = abs(row[i] - value)
+                known = one if away < np.float32(1e9) else zero  # none for NaN
+                sums[i] += known * (away if away < top else top)
+                counts[i] += known
+    out = np.full((2 * ny + 1, columns), np.inf)
     for j in range(2 * ny + 1):
-        for i in range(2 * nx + 1):
-            dx = (i - nx) * step
-            dy = (j - ny) * step
-            total = 0.0
-            seen = 0
-            for k in range(n):
-                a = x[k] + dx
-                b = y[k] + dy
-                if a < 0 or a >= w or b < 0 or b >= h:
-                    continue
-                away = abs(picture[b, a] - values[k])
-                if not away < np.inf:
-                    continue
-                seen += 1
-                total += min(away, most)
-            if seen >= least_seen * n and seen > 0:
-                out[j, i] = total / seen
+        for i in range(columns):
+            if seen[j, i] >= least_seen * n and seen[j, i] > 0:
+                out[j, i] = total[j, i] / seen[j, i]
     return out
