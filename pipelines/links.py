@@ -20,6 +20,10 @@ BRIDGE_FRAMES = 6  # frames that frame-to-frame steps alone may carry from a ver
 # median, and px at W = 1280 whatever the median is. Frames that follow their pictures stay below 3 times the median
 # (817 frames of a real clip, 14 generator clips); those that a giant carried off had 4 and more, focals 1 to 5 % wrong.
 MISFIT_PX, MISFIT_TIMES, MISFIT_ANY_PX = 1.0, 4.0, 5.0
+# A frame that fits half as badly is out if its zoom also leaves what the frames about it allow: px at W = 1280 at the
+# side of the picture, beyond the line between them and the lines that each side goes on in (a zoom starts or ends).
+SUSPECT_PX, SUSPECT_TIMES, DEPARTED_PX = 0.6, 3.0, 3.0
+SIDE_FRAMES = 5  # that give a side's rate of zoom
 
 
 def contradicted_frames(solution: Solution) -> NDArray[np.bool_]:
@@ -29,7 +33,30 @@ def contradicted_frames(solution: Solution) -> NDArray[np.bool_]:
     usual = float(np.median(known)) if len(known) else np.inf
     limit = min(max(MISFIT_PX * px, MISFIT_TIMES * usual), MISFIT_ANY_PX * px)
     with np.errstate(invalid="ignore"):
-        return np.asarray((solution.rms_px > limit) & (solution.frames != solution.reference))
+        out = solution.rms_px > limit
+        out |= _leaves_the_line(solution, max(SUSPECT_PX * px, SUSPECT_TIMES * usual))
+        return np.asarray(out & (solution.frames != solution.reference))
+
+
+def _leaves_the_line(solution: Solution, limit_px: float) -> NDArray[np.bool_]:
+    """(n,) bool: frames with a residual beyond limit_px whose log f departs from that of the frames about them."""
+    solved = np.isfinite(solution.log_f)
+    suspect = solved & (solution.rms_px > limit_px) & (solution.frames != solution.reference)
+    sound = solved & ~suspect
+    if not suspect.any() or sound.sum() < 2:
+        return np.zeros(len(solved), bool)
+    at, there = solution.frames[sound], solution.log_f[sound]
+    out = np.zeros(len(solved), bool)
+    for row in np.flatnonzero(suspect):
+        frame = solution.frames[row]
+        middle = int(np.searchsorted(at, frame))
+        allowed = [float(np.interp(frame, at, there))]
+        for side in (slice(max(middle - SIDE_FRAMES, 0), middle), slice(middle, middle + SIDE_FRAMES)):
+            if len(at[side]) >= 2:
+                allowed.append(float(np.polyval(np.polyfit(at[side] - frame, there[side], 1), 0.0)))
+        departed = max(min(allowed) - solution.log_f[row], solution.log_f[row] - max(allowed))
+        out[row] = departed * 640 > DEPARTED_PX
+    return out
 
 
 def verified_frames(frames: NDArray[np.int64], fits: Iterable[PairFit], reference: int) -> NDArray[np.bool_]:
