@@ -35,6 +35,10 @@ REASONS = {
 # Failures that say nothing about the pair: a picture that sees five times more cannot be the template of the other.
 _NO_VERDICT = ("low_overlap", "no_texture")
 
+# Cells of a small picture have few pixels: at 480 and 640 px right pairs (under 1 px of 1280) have up to .40 of them
+# away, wrong ones (over 4 px) .55 and more (40 rendered pairs from several starts, players 10 to 40 %).
+SMALL, SMALL_AWAY = 0.75, 0.1
+
 FINE_PX = 1280  # width of the pictures of the second look for features
 
 _RANK = {PairStatus.OK: 0, PairStatus.WEAK: 1, PairStatus.FAILED: 2, PairStatus.SKIPPED: 3}
@@ -55,7 +59,7 @@ class PairOptions:
     the homography puts them; max_std_px: or where the anchors' stated error is larger. sure_score, sure_away,
     sure_std_px: when no other start is tried; else the best of all starts is taken, by status and score (measured on
     160 hard pairs, with the checks above: 11 wrong answers called ok before, 2 after, both 2.0 px off). Pixels of a
-    picture 1280 wide, in proportion above.
+    picture 1280 wide, in proportion for others (below 960 px of width max_away is SMALL_AWAY larger).
     """
 
     selection: SelectionOptions = field(
@@ -195,8 +199,8 @@ def _ladders(route: str, levels: list[int]) -> list[list[int]]:
 
 
 def _scale_px(fit: PairFit) -> float:
-    """Pixel of a picture 1280 wide, in pixels of this one (at least one)."""
-    return max(1.0, (fit.anchors_px[:, 0].max() - fit.anchors_px[:, 0].min()) / (0.8 * 1280))
+    """Pixel of a picture 1280 wide, in pixels of this one."""
+    return float((fit.anchors_px[:, 0].max() - fit.anchors_px[:, 0].min()) / (0.8 * 1280))
 
 
 def _share_away(fit: PairFit, cell_px: float) -> float:
@@ -226,7 +230,8 @@ def _judged(fit: PairFit, options: PairOptions) -> PairFit:
     """The fit, weak where its own statistics do not speak for it."""
     if fit.status != PairStatus.OK:
         return fit
-    if _share_away(fit, options.cell_px) > options.max_away:
+    small = SMALL_AWAY if _scale_px(fit) < SMALL else 0.0
+    if _share_away(fit, options.cell_px) > options.max_away + small:
         return replace(fit, status=PairStatus.WEAK, reason="inconsistent")
     if _anchor_std_px(fit) > options.max_std_px * _scale_px(fit):
         return replace(fit, status=PairStatus.WEAK, reason="uncertain")
@@ -247,7 +252,7 @@ def _both_ways(
     if back.reason in _NO_VERDICT:
         return fit, back.n_steps
     away = transfer(back.H_dst_src, transfer(fit.H_dst_src, fit.flow.src_px)) - fit.flow.src_px
-    if back.usable and np.sqrt(np.mean(np.sum(away**2, axis=1))) <= options.symmetric_px:
+    if back.usable and np.sqrt(np.mean(np.sum(away**2, axis=1))) <= options.symmetric_px * _scale_px(fit):
         return fit, back.n_steps
     return replace(fit, status=PairStatus.WEAK, reason="asymmetric"), back.n_steps
 
