@@ -50,8 +50,8 @@ FLASH_LEFT = 0.3  # more in common across a cut: it was a flash
 GRADUAL = ((0.5, 2.0, 0.25, 0.25), (0.4, 0.5, 0.33, 0.5), (0.2, 0.5, 0.42, 0.5))
 # Two pictures that mix lose contrast (.7 to .77 is left in dissolves, .73 to .97 in soft wipes); what runs over
 # a picture does not, but moves it at once: 3.9 times what moves beside it. Players who fill the picture do neither
-# (.91 to 1.01, and at most 2.1 times).
-MIXED_CONTRAST, RUNS_OVER = 0.85, 2.5
+# (.84 to 1.01, and at most 2.1 times).
+MIXED_CONTRAST, RUNS_OVER = 0.8, 2.5
 LIKE_BEFORE = 0.7  # correlation of the blurred pictures: grass is grass, whatever the registration says
 DARK = 0.3  # contrast in the middle of a fade over that of both ends
 WINDOW = max(SPANS) + 30  # frames kept

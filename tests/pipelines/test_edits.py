@@ -12,7 +12,7 @@ from scipy import ndimage
 from benchmarks.edits import inside, matched
 from pipelines.config import Config
 from pipelines.decode import open_clip
-from pipelines.edits import EditFinder, EditFound
+from pipelines.edits import MIXED_CONTRAST, EditFinder, EditFound
 from pipelines.first_look import look_at
 from tests.pipelines.end_to_end import pan_spec
 from tests.synth.edits import Edit, Programme, blend, write_programme
@@ -92,6 +92,35 @@ def test_flashes_cut_nothing() -> None:
 def test_a_pan_is_no_edit_even_where_its_motion_is_not_known(step_px: float) -> None:
     """Without the motion two pictures have nothing in common after a while, but the old view never gave way at once."""
     assert found(view(1, 100), step_px) == []
+
+
+def crowded(seed: int, n: int) -> Pictures:
+    """A slow pan behind seven players, each a quarter of the picture high and more, who run through it."""
+    rng = np.random.default_rng(seed)
+    looks = [ndimage.zoom(rng.uniform(0, 255, (14, 7)), 8, order=1) for _ in range(7)]
+    left, top, speed = rng.uniform(-20, W - 40, 7), rng.uniform(20, 60, 7), rng.normal(0, 3, 7)
+    pictures = view(seed, n, 1)
+    for k, picture in enumerate(pictures):
+        for i, look in enumerate(looks):
+            x = int(left[i] + speed[i] * k + 10 * np.sin(0.15 * k + i))
+            y = int(top[i] + 6 * np.sin(0.3 * k + 2 * i))
+            if not -look.shape[1] < x < W:
+                continue
+            seen = look[: H - y, max(0, -x) : W - x]
+            picture[y : y + seen.shape[0], max(0, x) : max(0, x) + seen.shape[1]] = seen
+    return pictures
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_dissolve_loses_contrast_and_players_who_fill_the_picture_do_not(seed: int) -> None:
+    left = {}
+    dissolve = joined(view(seed, 50), view(seed + 10, 50), Edit(kind="dissolve", n_frames=20))
+    for name, pictures in (("dissolve", dissolve), ("players", crowded(seed, 80))):
+        finder = EditFinder((W, H))
+        for k, picture in enumerate(pictures):
+            finder.push(k, picture, None)
+        left[name] = finder._contrast_left(29, 50)
+    assert left["dissolve"] < MIXED_CONTRAST - 0.03 and left["players"] > MIXED_CONTRAST + 0.03
 
 
 @pytest.mark.slow
