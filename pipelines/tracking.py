@@ -24,8 +24,9 @@ from mosaic.records import FlowGrid, PairFit, PairStatus
 from mosaic.rescue import match_features, phase_correlation
 from mosaic.rivals import better_of_rivals
 from mosaic.screen import WIDER, ScreenVotes, moves_more_widely, without_still
+from mosaic.stiff import StiffHomographyFamily
 from mosaic.template import PreparedTemplate, SelectionOptions, Template, prepare, with_level
-from mosaic.warp import HomographyFamily, WarpFamily
+from mosaic.warp import WarpFamily
 from pipelines.bridge import CameraPose, RotationZoomFamily, edge_from_fit, pair_state, pose_from_state
 from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import KeyframeImages, distance_in_widths
@@ -194,8 +195,8 @@ class ShotTracker:
 
     # -- registration ------------------------------------------------------------------------------------------
 
-    def _free_family(self) -> HomographyFamily:
-        return HomographyFamily(size_px=self.size_px)
+    def _free_family(self) -> StiffHomographyFamily:
+        return StiffHomographyFamily(size_px=self.size_px)
 
     def _step_free(self, frame: int, pyramid: Pyramid) -> bool:
         """8-parameter registration: to the previous frame from constant velocity, then to the keyframe."""
