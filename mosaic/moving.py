@@ -2,10 +2,10 @@
 
 A median cannot know who is the ground where a player covers it in half of the views. But he is wider than the place
 where he covers it so often: elsewhere he stands before ground that most views agree on, and there he is seen to
-differ from it. Where he covers it in most views, the grass round about tells: of two colours the one that fits there
-is the ground, and the views that agree with the other one show him. The whole of him is distrusted in those frames,
-and the next round's composite is free of more of him. All of it happens at a fraction of the resolution: cost is a
-few per cent of the final composite per round.
+differ from it. Where he covers it in most views, his outline tells: it is there in the composite, and not in the few
+frames that show the ground (contest.py). What these agree on is taken for the ground, all other views of the place
+are distrusted, and the next round's composite is free of more of him. All of it happens at a fraction of the
+resolution: cost is a few per cent of the final composite per round.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.canvas import Canvas
+from mosaic.contest import GHOST, SAME_GREY, Correction, GroundVote, apart, verdict
 from mosaic.motion import expand_map, local_contrast
 from mosaic.surface import Placement, Surface
 from mosaic.tile_maps import GRID_PX, Scene
@@ -45,9 +45,13 @@ GROUND_PX, GROUND_SHRINK = (
 PLAIN_GREY = 16.0  # usual distance from the ground round about, above which that is no plain ground
 HALO, LIFTED = 8, 150  # trust close round what moves; and there where the colour is that of the plain ground
 NEAR, NEAR_AREA_PX = 100, 30  # trust about a body, and small px of the least piece taken for one
-MOMENT_FRAMES = 6  # views nearer than this say the same about a place
+CONTESTED = 0.0002  # share of the surface corrected in a round, from which another round is worth its time
+MORE_ROUNDS = 2
 AGREE = 0.8 * 255  # support from which views are taken to agree
 STEP_PX = 16  # spacing of exact map points in the small frame
+
+
+Planes = list[NDArray[np.uint8]]
 
 
 def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.uint8]]:
@@ -62,28 +66,37 @@ def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.
     shrink = max(1, round(width / SMALL_WIDTH_PX))
     small = _small_scene(scene, shrink)
     nodes = [_map_nodes(placement, small.surface, shrink) for placement in scene.views]
-    known = scene.still
-    still = known
+    everywhere = np.full((1, 1), 255, np.uint8)
+    known: Planes = [everywhere] * len(scene.views) if scene.still is None else list(scene.still)
+    still = scene.still
+    done, most = 0, scene.options.motion_rounds
     with ThreadPoolExecutor(scene.options.threads) as pool:
-        for _ in range(scene.options.motion_rounds):
+        while done < most:
             layers = paint(replace(small, still=still), Canvas(tempfile.gettempdir(), 1 << 30))
 
             ground = _surroundings(layers)
 
-            def compare(index: int, layers: Layers = layers, ground: Ground = ground) -> _Compared:
-                return _compare(small, index, layers, ground, nodes[index], shrink)
+            def compare(
+                index: int, layers: Layers = layers, ground: Ground = ground, known: Planes = known
+            ) -> _Compared:
+                return _compare(small, index, layers, ground, nodes[index], shrink, known[index])
 
             compared = list(pool.map(compare, range(len(scene.views))))
-            wrong = _where_composite_is_wrong(scene, compared, nodes, layers.n_seen.shape)
+            correction = _correction(scene, compared, nodes, layers)
 
             def judge(
-                index: int, compared: list[_Compared] = compared, wrong: NDArray[np.uint8] = wrong
-            ) -> NDArray[np.uint8]:
-                return _still_plane(
-                    compared[index], nodes[index], wrong, None if known is None else known[index]
-                )
+                index: int,
+                compared: list[_Compared] = compared,
+                correction: Correction = correction,
+                known: Planes = known,
+            ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+                return _still_plane(compared[index], nodes[index], correction, known[index])
 
-            still = tuple(pool.map(judge, range(len(scene.views))))
+            planes = list(pool.map(judge, range(len(scene.views))))
+            still, known = tuple(plane for plane, _ in planes), [corrected for _, corrected in planes]
+            done += 1
+            if done == scene.options.motion_rounds and correction.accepted.mean() > CONTESTED:
+                most += MORE_ROUNDS
     assert still is not None
     return still, _quiet(layers, scene.options, shrink)
 
@@ -124,69 +137,59 @@ Ground = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Compared:
-    """One small frame against the composite, (h, w) bool: moves, where the frame shows an object before the composite's
-    ground; ghost, where the composite shows one and the frame ground; foreign, where the frame shows what does not fit
-    the ground round about; plain, where it shows just that."""
+    """One small frame against the composite: picture (h, w, 3), levelled; (h, w) bool: moves, where it shows an object
+    before the composite's ground; ghost, where the composite shows one and the frame ground; plain, where the frame
+    shows just what the plain ground round about is."""
 
+    picture: NDArray[np.uint8]
     moves: NDArray[np.bool_]
     ghost: NDArray[np.bool_]
-    foreign: NDArray[np.bool_]
     plain: NDArray[np.bool_]
 
 
 def _compare(
-    scene: Scene, index: int, layers: Layers, ground: Ground, nodes: NDArray[np.float64], shrink: int
+    scene: Scene,
+    index: int,
+    layers: Layers,
+    ground: Ground,
+    nodes: NDArray[np.float64],
+    shrink: int,
+    known: NDArray[np.uint8],
 ) -> _Compared:
     stored = scene.store.get(scene.views[index].frame, shrink)
     height, width = stored.rgb.shape[:2]
     at = expand_map(nodes, STEP_PX, (width, height))
     truth = np.asarray(cv2.remap(layers.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.uint8)
-    facts = np.stack([layers.spread, layers.support, layers.n_seen], axis=-1)
-    spread, support, n_seen = np.moveaxis(cv2.remap(facts, at[..., 0], at[..., 1], cv2.INTER_NEAREST), -1, 0)
+    facts = np.stack([layers.support, layers.n_seen], axis=-1)
+    support, n_seen = np.moveaxis(cv2.remap(facts, at[..., 0], at[..., 1], cv2.INTER_NEAREST), -1, 0)
     frame = _levelled(stored.rgb, scene.gains[index])
-    apart = _apart(frame, truth)
     # Fine detail that lies a fraction of a pixel off differs without moving: allow for what a neighbour would explain.
     detail = local_contrast(truth)
-    seen = n_seen > 1
+    seen = (n_seen > 1) & (cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
     if stored.trust is not None:
         seen &= stored.trust > 0
-    if (
-        scene.still is not None
-    ):  # what is known to move is left out: then the rest shows the composite's faults
-        plane = cv2.resize(scene.still[index], (width, height), interpolation=cv2.INTER_NEAREST)
-        seen &= plane > DISTRUSTED
-    differs = (apart > DIFFERENT_GREY + 2.0 * np.minimum(spread, 20) + 0.25 * detail) & seen
+    differs = (apart(frame, truth) > DIFFERENT_GREY + 0.25 * detail) & seen
     opened = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    n, labels = cv2.connectedComponents(opened, connectivity=8)
+    n, found = cv2.connectedComponents(opened, connectivity=8)
+    labels = np.asarray(found, np.int32)
     area = np.bincount(labels.ravel(), minlength=n)
     certain = np.bincount(labels.ravel(), weights=(support.ravel() > CERTAIN), minlength=n)
     seed = certain > MIN_SEED * area
     seed[0] = False
+    outline = verdict(frame, truth, labels, area)
     around, usual = (cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR) for picture in ground)
-    here, there = _apart(frame, around), _apart(truth, around)
-    strange = STRANGE * usual + DIFFERENT_GREY
-    fits, misfits = (0.5 * there > here) & (there > strange), (0.5 * here > there) & (here > strange)
+    here, there = apart(frame, around), apart(truth, around)
+    strange, on_plain = STRANGE * usual + DIFFERENT_GREY, usual < PLAIN_GREY
+    fits = on_plain & (0.5 * there > here) & (there > strange)
+    misfits = on_plain & (0.5 * here > there) & (here > strange)
     differs = opened > 0
-    plain = (usual < PLAIN_GREY) & (here < 1.5 * usual + 0.5 * DIFFERENT_GREY)
+    ghost = differs & (fits | (outline < GHOST)) & ~misfits
     return _Compared(
-        moves=differs & (misfits | seed[labels] & ~fits),
-        ghost=differs & fits,
-        foreign=seen & (here > strange) & (~differs | (usual < PLAIN_GREY)),
-        plain=plain,
+        picture=frame,
+        moves=differs & ~ghost & (misfits | seed[labels] & (outline > 0)),
+        ghost=ghost,
+        plain=on_plain & (here < 1.5 * usual + 0.5 * DIFFERENT_GREY),
     )
-
-
-@numba.njit(cache=True, nogil=True)
-def _apart(a, b):  # type: ignore[no-untyped-def]
-    """Mean difference (h, w) float32 of the channels of two pictures, green twice."""
-    out = np.empty(a.shape[:2], np.float32)
-    for i in range(a.shape[0]):
-        for j in range(a.shape[1]):
-            red = abs(np.int32(a[i, j, 0]) - np.int32(b[i, j, 0]))
-            green = abs(np.int32(a[i, j, 1]) - np.int32(b[i, j, 1]))
-            blue = abs(np.int32(a[i, j, 2]) - np.int32(b[i, j, 2]))
-            out[i, j] = np.float32(0.25) * np.float32(red + 2 * green + blue)
-    return out
 
 
 def _levelled(rgb: NDArray[np.uint8], gain: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -206,7 +209,7 @@ def _surroundings(layers: Layers) -> tuple[NDArray[np.uint8], NDArray[np.float32
     tiny = np.asarray(cv2.resize(layers.image, size, interpolation=cv2.INTER_AREA), np.uint8)
     colour = cv2.resize(cv2.medianBlur(tiny, side), (width, height), interpolation=cv2.INTER_LINEAR)
     away = cv2.resize(
-        _apart(layers.image, np.asarray(colour, np.uint8)), size, interpolation=cv2.INTER_NEAREST
+        apart(layers.image, np.asarray(colour, np.uint8)), size, interpolation=cv2.INTER_NEAREST
     )
     usual = cv2.medianBlur(np.clip(np.rint(away), 0, 255).astype(np.uint8), side).astype(np.float32)
     return np.asarray(colour, np.uint8), np.asarray(
@@ -214,60 +217,60 @@ def _surroundings(layers: Layers) -> tuple[NDArray[np.uint8], NDArray[np.float32
     )
 
 
-def _where_composite_is_wrong(
-    scene: Scene, compared: list[_Compared], nodes: list[NDArray[np.float64]], shape: tuple[int, ...]
-) -> NDArray[np.uint8]:
-    """(h, w) uint8 over the small surface: 1 where frames of more than one moment say that an object was painted."""
-    count = np.zeros(shape, np.uint8)
-    last: NDArray[np.int32] = np.full(shape, -(10**6), np.int32)
+def _correction(
+    scene: Scene, compared: list[_Compared], nodes: list[NDArray[np.float64]], layers: Layers
+) -> Correction:
+    """Where the frames that show ground agree that the composite shows an object, and on what is there instead."""
+    height, width = layers.n_seen.shape
+    vote = GroundVote((height, width))
     for view, one, corners in zip(scene.views, compared, nodes, strict=True):
-        if not one.ghost.any():
-            continue
-        height, width = one.ghost.shape
-        at = np.rint(expand_map(corners, STEP_PX, (width, height))[one.ghost]).astype(np.intp)
-        at = at[((at >= 0) & (at < [shape[1], shape[0]])).all(axis=-1)]
-        hit = np.zeros(shape, np.uint8)
-        hit[at[:, 1], at[:, 0]] = 1
-        new = (cv2.dilate(hit, np.ones((3, 3), np.uint8)) > 0) & (view.frame - last >= MOMENT_FRAMES)
-        count[new] += 1
-        last[new] = view.frame
-    return np.asarray(count >= 2, np.uint8)
+        if one.ghost.any():
+            at = expand_map(corners, STEP_PX, (one.ghost.shape[1], one.ghost.shape[0]))
+            vote.add(view.frame, one.picture, one.ghost, at)
+    return vote.correct(layers.image, DIFFERENT_GREY)
 
 
 def _still_plane(
-    one: _Compared, nodes: NDArray[np.float64], wrong: NDArray[np.uint8], known: NDArray[np.uint8] | None
-) -> NDArray[np.uint8]:
-    """What moves in a frame, closed to whole bodies; and what agrees with the composite where that shows an object.
+    one: _Compared, nodes: NDArray[np.float64], correction: Correction, known: NDArray[np.uint8]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """What moves in a frame, closed to whole bodies; and `known` for the next round.
 
-    known: a plane of before, at any resolution; what is low there stays low, but for a halo that is plain ground."""
+    known: a plane of before, at any resolution; what is low there stays low, but for a halo that is plain ground.
+    Where the composite was corrected the frame is trusted when it shows the ground that was voted for, else not."""
     height, width = one.moves.shape
     side = 2 * max(2, round(width / 40)) + 1  # bridges a gap of a twentieth of the width
+    if known.shape != (height, width):  # finer planes keep outlines that the comparison does not see
+        known = np.asarray(cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
     core = one.moves.astype(np.uint8)
-    if wrong.any():
+    shows = np.zeros((height, width), bool)
+    if correction.accepted.any():
         at = expand_map(nodes, STEP_PX, (width, height))
-        ghost = cv2.remap(wrong, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0
-        core |= (ghost & one.foreign).astype(np.uint8)
+        wrong = cv2.remap(correction.accepted, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0
+        ground = np.asarray(cv2.remap(correction.ground, at[..., 0], at[..., 1], cv2.INTER_NEAREST), np.uint8)
+        agrees = apart(one.picture, ground) < SAME_GREY
+        shows, hides = wrong & agrees, wrong & ~agrees
+        core |= hides.astype(np.uint8)
+        known = np.where(_resized(hides, known) & (known > DISTRUSTED), np.uint8(DISTRUSTED), known)
+        known[_resized(shows, known) & (known > 0)] = 255
     body = cv2.dilate(cv2.morphologyEx(core, cv2.MORPH_CLOSE, _disc(side), borderValue=0), _disc(5))
-    closed = body
-    if known is not None:  # who was seen moving stands as close by
-        moving = cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST) <= DISTRUSTED
-        closed = np.maximum(body, moving.astype(np.uint8))
-    plane = _near_bodies(np.asarray(closed, np.uint8))
+    # Who was seen moving stands as close by.
+    moving = cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST) <= DISTRUSTED
+    plane = _near_bodies(np.maximum(body, moving.astype(np.uint8)))
     plane[body > 0] = HALO
     plane[core > 0] = DISTRUSTED
-    if known is None:
-        plane[one.plain & (plane == NEAR)] = 255
-        plane[one.plain & (plane == HALO)] = LIFTED
-        return np.asarray(plane, np.uint8)
     size = (known.shape[1], known.shape[0])
-    if known.size < plane.size:
-        size = (width, height)
-        known = np.asarray(cv2.resize(known, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     plane = np.minimum(cv2.resize(plane, size, interpolation=cv2.INTER_NEAREST), known)
-    plain = cv2.resize(one.plain.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    plain = _resized(one.plain, known)
     plane[plain & (plane == NEAR)] = 255
     plane[plain & (plane == HALO)] = LIFTED
-    return np.asarray(plane, np.uint8)
+    plane[_resized(shows, known) & (known > 0)] = 255
+    return np.asarray(plane, np.uint8), np.asarray(known, np.uint8)
+
+
+def _resized(flags: NDArray[np.bool_], like: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Flags (h, w) at the resolution of another plane, nearest."""
+    size = (like.shape[1], like.shape[0])
+    return np.asarray(cv2.resize(flags.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0, np.bool_)
 
 
 def _near_bodies(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
