@@ -56,7 +56,9 @@ def second_pass(
         picture = cache(frame.picture)  # a conversion, and both may ask for it
         small = moving.reduce(frame.index, picture)
         if frame.index in planned:
-            store.put(frame.index, picture(), mask, small=None if small is None else small.rgb)
+            # Of a small clip the reduced picture is the picture itself, and the store makes its own smaller ones.
+            reduced = small.rgb if small is not None and small.rgb.shape != picture().shape else None
+            store.put(frame.index, picture(), mask, small=reduced)
         return small
 
     def judge(index: int, kept: Future[Small | None]) -> None:
