@@ -313,7 +313,8 @@ def read_run(path: str | Path) -> RunRecord:
 
 def shot_from_dict(data: Mapping[str, Any]) -> ShotRecord:
     """A ShotRecord from its JSON form. Raises KeyError, TypeError when it is not one."""
-    values = {f.name: data[f.name] for f in fields(ShotRecord)}
+    # merged_into came later: a run.json without it knows of no merging.
+    values = {f.name: data[f.name] for f in fields(ShotRecord) if f.name != "merged_into" or f.name in data}
     values["files"] = tuple(values["files"])
     values["warnings"] = tuple(values["warnings"])
     return ShotRecord(**values)

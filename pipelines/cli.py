@@ -118,13 +118,17 @@ def _split_settings(args: Sequence[str]) -> tuple[list[str], list[str]]:
     return plain, dotted
 
 
-def _settings(context: typer.Context, path: Path | None, exports: str = "") -> Config:
+def _settings(
+    context: typer.Context, path: Path | None, exports: str = "", merge_shots: bool = False
+) -> Config:
     from pipelines.config import load_config, parse_overrides
     from pipelines.exports.formats import format_named
 
     overrides = parse_overrides(context.obj or [])
     if exports:
         overrides["output.exports"] = ",".join(format_names(exports))
+    if merge_shots:
+        overrides["shots.merge"] = "true"
     settings = load_config(path, overrides)
     for name in settings.output.exports:
         format_named(name).check()  # a missing extra shows now, not after the hours that a run may take
@@ -187,6 +191,13 @@ def run(
             autocompletion=complete_names,
         ),
     ] = "",
+    merge_shots: Annotated[
+        bool,
+        typer.Option(
+            "--merge-shots",
+            help="One camera frame and panorama for shots that one camera took from one place.",
+        ),
+    ] = False,
     resume: Resume = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -194,7 +205,7 @@ def run(
     help_config: HelpConfig = False,
 ) -> int:
     """Camera track, homographies, panorama and report of one clip, or of many (a folder each)."""
-    settings = _settings(context, config, export)
+    settings = _settings(context, config, export, merge_shots)
     set_up_logging(quiet, verbose)
     if clip_list is not None or len(clips or ()) > 1:
         from pipelines.cli_many import run_clips

@@ -90,10 +90,12 @@ def compare_shot(
 ) -> dict[str, Any]:
     """Errors of one shot. truth: columns aligned with the table's rows, NaN where the truth has no such frame.
 
-    Frames that truly belong to another shot than the reference frame are counted (`wrong_shot`) and left out.
+    Frames that truly belong to another shot than the reference frame are counted (`wrong_shot`) and left out. The
+    reference of a merged shot is a frame of the earlier one: its frames belong where most of them do.
     """
     mine = table.shot == shot.index
-    reference = np.flatnonzero(mine & (table.frame == shot.reference_frame))
+    home = shot.index if shot.merged_into is None else shot.merged_into
+    reference = np.flatnonzero((table.shot == home) & (table.frame == shot.reference_frame))
     result: dict[str, Any] = {
         "shot": shot.index,
         "status": shot.status,
@@ -103,10 +105,11 @@ def compare_shot(
         **{key: None for key, _, _, _ in COLUMNS},
     }
     known = mine & np.isfinite(truth["f_px"])
-    if len(reference) != 1 or not known[reference[0]]:
+    if len(reference) != 1 or not np.isfinite(truth["f_px"][reference[0]]) or not known.any():
         return {**result, "compared": 0, "wrong_shot": 0, "note": "the reference frame is not in the truth"}
     ref = int(reference[0])
-    wrong = known & (truth["shot"] != truth["shot"][ref])
+    true_shot = truth["shot"][ref] if home == shot.index else np.median(truth["shot"][known])
+    wrong = known & (truth["shot"] != true_shot)
     rows = np.flatnonzero(known & ~wrong)
     result |= {"compared": len(rows), "wrong_shot": int(wrong.sum())}
     result["registered"] = int(sum(table.status[i] not in UNCALIBRATED for i in rows))

@@ -264,6 +264,13 @@ class ShotOptions(Section):
             "picture of a shot"
         ),
     )
+    merge: bool = Field(
+        default=False,
+        description=(
+            "shots of one camera (after a replay or cutaway) share one calibration, camera frame and panorama, where "
+            "verified pairs show that it is the same camera; run.json says why, or why not"
+        ),
+    )
 
 
 class PanoramaOptions(Section):

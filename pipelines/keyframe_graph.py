@@ -11,6 +11,7 @@ import os
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,14 @@ NEAREST, FARTHEST = (
     4,
     8,
 )  # earlier keyframes that each one is paired with: the near ones hold, the far ones measure f
+
+
+class KeyframePictures(Protocol):
+    """Where keyframes' pictures come from: of one shot (KeyframeImages) or of several (merging.py)."""
+
+    def pyramid(self, frame: int, n_levels: int, mask: NDArray[np.bool_] | None) -> Pyramid:
+        """See KeyframeImages.pyramid."""
+        ...
 
 
 class KeyframeImages:
@@ -117,7 +126,7 @@ def distance_in_widths(a: CameraPose, b: CameraPose, width_px: int) -> float:
 
 def refine_keyframes(
     templates: dict[int, Template],
-    images: KeyframeImages,
+    images: KeyframePictures,
     first_fits: list[PairFit],
     *,
     size_px: tuple[int, int],
@@ -168,7 +177,7 @@ def refine_keyframes(
 
 def _without_lens(
     templates: dict[int, Template],
-    images: KeyframeImages,
+    images: KeyframePictures,
     first_fits: list[PairFit],
     n_levels: int,
     mask: NDArray[np.bool_] | None,
@@ -210,7 +219,7 @@ def _best_linked(graph: HomographyGraph) -> int:
 
 def register_pairs(
     templates: dict[int, Template],
-    images: KeyframeImages,
+    images: KeyframePictures,
     solution: Solution,
     n_levels: int,
     mask: NDArray[np.bool_] | None,

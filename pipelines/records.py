@@ -72,7 +72,8 @@ class ShotRecord:
     only), 'failed'. reason: code and sentence why it is not 'ok'. focal: min/max f_px, their f_std_px, or None.
     calibration: what the calibrator said (sigma parts, s10_px, chi2_dof, lens, level, keyframes, edges).
     panorama: surface, size, files, or None with a reason. files: names relative to OUT.
-    status_counts: frames per status. timings_s: seconds per stage.
+    status_counts: frames per status. timings_s: seconds per stage. merged_into: the earlier shot whose world and
+    reference frame this one's cameras are in (its reference_frame is a frame of that shot), or None.
     """
 
     index: int
@@ -89,6 +90,7 @@ class ShotRecord:
     status_counts: Mapping[str, int]
     timings_s: Mapping[str, float]
     warnings: tuple[str, ...] = ()
+    merged_into: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -16,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,9 @@ from pipelines.config import Config
 from pipelines.decode import Clip, Frame, open_clip
 from pipelines.errors import InputError
 from pipelines.exports.exporter import export_for_run
+from pipelines.kept_shots import ShotShelf
 from pipelines.keyframe_graph import KeyframeImages
+from pipelines.merged_shots import merge_shots
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.overlays import OverlayFinder, both_masks
 from pipelines.preparation import PreparedFrame, prepare_frame
@@ -72,6 +75,8 @@ class _Job:
     n_levels: int = 4
     second: Iterator[Frame] | None = None
     graphics: dict[int, str] = field(default_factory=dict)  # frames of gradual edits: what they are
+    shelf: ShotShelf | None = None  # of solved shots, where they may be merged
+    merging: dict[str, Any] = field(default_factory=dict)
 
     def second_frames(self) -> Iterator[Frame]:
         """The second decoding, going on where the shot before ended."""
@@ -101,6 +106,10 @@ def process(
         tempfile.TemporaryDirectory(prefix=".scratch-", dir=folder.staging) as scratch,
     ):
         finished = {record.index: (record, rows) for record, rows in folder.finished_shots()}
+        if finished and config.shots.merge:
+            # Files of an interrupted run do not hold what merging needs: keyframes, pairs, pictures.
+            log.warning("--resume: shots are solved again, because merging needs more of them than was kept")
+            finished = {}
         job = _Job(
             clip=opened,
             folder=folder,
@@ -112,8 +121,16 @@ def process(
         )
         if config.overlays.enabled:
             job.overlays = OverlayFinder(opened.facts.size_px, config.overlays)
+        if config.shots.merge:
+            job.shelf = ShotShelf(job.scratch)
         try:
             _first_pass(job)
+            if job.shelf is not None:
+                with job.timings.measure("merge"):
+                    job.merging = merge_shots(
+                        job.shelf, job.records, job.tables, config=config, folder=folder, scratch=job.scratch,
+                        progress=job.progress,
+                    )  # fmt: skip
         finally:
             _close(job)
         table = _whole_table(job)
@@ -237,7 +254,7 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
         mask = job.overlays.mask() if job.overlays is not None else None
         solved = solve_shot(
             tracker, facts, index, job.second_frames, images=images, mask=mask, n_levels=job.n_levels,
-            config=job.config, scratch=job.scratch, progress=job.progress,
+            config=job.config, scratch=job.scratch, progress=job.progress, keep_frames=job.shelf is not None,
         )  # fmt: skip
         with solved.timings.measure("write"):
             record = write_shot(job.folder, index, tracker, solved, job.config)
@@ -247,8 +264,12 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
         for stage, seconds in solved.timings.seconds.items():
             job.timings.seconds[stage] = job.timings.seconds.get(stage, 0.0) + seconds
         job.folder.save_shot(record, rows)
+        if job.shelf is not None:
+            own = [facts[o.frame] for o in tracker.observations]
+            job.shelf.put(index, tracker, solved, own, images, mask, job.n_levels)
     job.thumbnails |= thumbnails(tracker)
-    images.close()
+    if job.shelf is None:
+        images.close()
     job.images.pop(id(tracker), None)
     job.records.append(record)
     job.tables.append(rows)
@@ -278,9 +299,13 @@ def _record(job: _Job, clip: Clip) -> RunRecord:
         world = "levelled head frame where calibration.level says observable, else the reference camera"
     else:
         world = "reference camera of each shot"
+    if any(r.merged_into is not None for r in job.records):
+        world += "; a merged shot's is that of the shot it is merged into"
     versions = {"broadcast-mosaic": program_version(), "python": platform.python_version()}
     versions |= {name: metadata.version(name) for name in PACKAGES}
-    extra = {"overlays": job.overlays.facts()} if job.overlays is not None else {}
+    extra: dict[str, Any] = {"overlays": job.overlays.facts()} if job.overlays is not None else {}
+    if job.merging:
+        extra["merging"] = job.merging
     return RunRecord(
         versions=versions,
         config=job.config.as_dict(),
@@ -299,3 +324,5 @@ def _close(job: _Job) -> None:
     for images in job.images.values():
         images.close()
     job.images.clear()
+    if job.shelf is not None:
+        job.shelf.close()

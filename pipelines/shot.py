@@ -93,6 +93,8 @@ class CalibratedShot:
     panorama: Panorama | None
     no_panorama: str
     timings: Timings
+    fits: tuple[PairFit, ...] = ()  # that the poses were solved from
+    store: FrameStore | None = None  # the panorama's frames, open, where they were asked for
 
 
 def solve_shot(
@@ -107,8 +109,9 @@ def solve_shot(
     config: Config,
     scratch: Path,
     progress: Callable[[str, int, int | None], None],
+    keep_frames: bool = False,
 ) -> CalibratedShot:
-    """Second half of the job for one shot.
+    """Second half of the job for one shot. keep_frames: leave the panorama's frames open; the caller closes them.
 
     facts: per frame number. frames: starts (or goes on with) a second decoding of the clip that will reach the shot's
     frames. mask: usable pixels, as known at the shot's end. Raises only on mistakes; bad footage is a verdict.
@@ -137,12 +140,9 @@ def solve_shot(
         verdict = judge(
             result.solution, result.graph, GateOptions(refine=result.options), pupil_shift_log_f=shift
         )
-        head = level(result.solution)
-        if not verdict.sigma_log_f_total < LEVEL_SIGMA:
-            # An axis found with a focal that is not known is as wrong as that focal.
-            head = replace(head, observable=False, reason="focal_unknown", sentence=LEVEL_NEEDS_FOCAL)
+        head = believed_level(level(result.solution), verdict)
     with timings.measure("poses"):
-        approximate = _poses(tracker, result, tracker.fits)
+        approximate = frame_poses(tracker, result, tracker.fits)
     shot_facts = [facts[o.frame] for o in tracker.observations]
     usable = config.panorama.enabled and np.isfinite(approximate.log_f).sum() >= 1
     if not usable:
@@ -155,7 +155,7 @@ def solve_shot(
         why = "switched off" if not config.panorama.enabled else "no frame has a camera"
         return CalibratedShot(
             solution=approximate, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, tracker.fits),
-            rows=rows, panorama=None, no_panorama=why, timings=timings,
+            rows=rows, panorama=None, no_panorama=why, timings=timings, fits=tuple(tracker.fits),
         )  # fmt: skip
 
     world = head.R_head_world if head.observable else np.eye(3)
@@ -163,6 +163,7 @@ def solve_shot(
     with timings.measure("plan"):
         surface, plan = _plan(approximate, tracker, world, config, options, result.parallax)
     store = FrameStore(scratch, tracker.size_px)
+    done = False
     try:
         with timings.measure("second pass"):
             # Only where frames lie relative to each other counts here: the axes of the reference will do.
@@ -179,7 +180,7 @@ def solve_shot(
                 threads=config.run.threads or 2, progress=progress,
             )  # fmt: skip
         with timings.measure("poses"):
-            solution = _poses(tracker, result, [*fits, *_steps(tracker)])
+            solution = frame_poses(tracker, result, [*fits, *frame_steps(tracker)])
             solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
         with timings.measure("composite"):
             fitting = replace(solution, log_f=np.where(contradicted_frames(solution), np.nan, solution.log_f))
@@ -190,8 +191,10 @@ def solve_shot(
             )  # fmt: skip
             if config.panorama.crop == "inside":
                 panorama = crop_inside(panorama)
+        done = True
     finally:
-        store.close()
+        if not (keep_frames and done):
+            store.close()
     rows = shot_rows(
         shot=shot,
         facts=shot_facts,
@@ -203,8 +206,16 @@ def solve_shot(
     )
     return CalibratedShot(
         solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
-        rows=rows, panorama=panorama, no_panorama="", timings=timings,
+        rows=rows, panorama=panorama, no_panorama="", timings=timings, fits=tuple(fits),
+        store=store if keep_frames else None,
     )  # fmt: skip
+
+
+def believed_level(head: Level, verdict: Verdict) -> Level:
+    """The pan axis, if the focal is known: an axis found with a focal that is not known is as wrong as that focal."""
+    if verdict.sigma_log_f_total < LEVEL_SIGMA:
+        return head
+    return replace(head, observable=False, reason="focal_unknown", sentence=LEVEL_NEEDS_FOCAL)
 
 
 def priors_of(config: Config, pixel_aspect: float) -> Priors:
@@ -290,7 +301,7 @@ def _with_known_focal(
     frame = result.solution.reference if known.focal_frame is None else known.focal_frame
     if frame not in frames:
         return result
-    track = _poses(tracker, result, tracker.fits)
+    track = frame_poses(tracker, result, tracker.fits)
     row = np.flatnonzero(track.frames == frame)
     if not len(row) or not np.isfinite(track.log_f[row[0]]):
         return result
@@ -310,7 +321,7 @@ def _with_known_focal(
     return replace(result, solution=refined) if np.isfinite(refined.log_f).any() else result
 
 
-def _poses(tracker: ShotTracker, result: KeyframeResult, fits: Sequence[PairFit]) -> Solution:
+def frame_poses(tracker: ShotTracker, result: KeyframeResult, fits: Sequence[PairFit]) -> Solution:
     """Every frame against the held keyframes. A shot of one keyframe keeps its prior focal and is never claimed."""
     held = result.solution
     frames = [o.frame for o in tracker.observations if o.status != "lost" and o.reason != "duplicate"]
@@ -361,7 +372,7 @@ def _with_duplicates(solution: Solution, tracker: ShotTracker) -> Solution:
     )
 
 
-def _steps(tracker: ShotTracker) -> list[PairFit]:
+def frame_steps(tracker: ShotTracker) -> list[PairFit]:
     """Frame-to-frame pairs of the first pass: they keep the track smooth where the keyframe changes."""
     order = [o.frame for o in tracker.observations if o.reason != "duplicate"]
     before = dict(zip(order[1:], order[:-1], strict=True))
@@ -400,7 +411,10 @@ def lost_rows(facts: Sequence[FrameFacts], reason: str) -> CameraTable:
 __all__ = [
     "CalibratedShot",
     "Timings",
+    "believed_level",
     "concatenate",
+    "frame_poses",
+    "frame_steps",
     "lost_rows",
     "placements_of",
     "priors_of",

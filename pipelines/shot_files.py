@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -41,6 +42,17 @@ def write_shot(
         files += write_panorama(folder, name, shot, config)
         panorama = panorama_facts(shot.panorama)
         shot.panorama.release()
+    return shot_record(index, tracker, shot, files, panorama)
+
+
+def shot_record(
+    index: int,
+    tracker: ShotTracker,
+    shot: CalibratedShot,
+    files: Sequence[str],
+    panorama: Mapping[str, Any] | None,
+) -> ShotRecord:
+    """What run.json says of a shot whose files are written."""
     rows = shot.rows
     counts = status_counts(rows)
     solved = np.isfinite(rows.zoom_ratio)
@@ -77,7 +89,7 @@ def write_shot(
         files=tuple(files),
         status_counts=counts,
         timings_s=dict(shot.timings.seconds),
-        warnings=() if shot.panorama is not None else (f"no panorama: {shot.no_panorama}",),
+        warnings=() if panorama is not None else (f"no panorama: {shot.no_panorama}",),
     )
 
 
@@ -157,11 +169,18 @@ def thumbnails(tracker: ShotTracker) -> dict[int, bytes]:
     return encoded
 
 
-def write_panorama(folder: OutputFolder, name: str, shot: CalibratedShot, config: Config) -> list[str]:
-    """Stage panorama.tif, .jpg, .json and .pto of a shot, .png and .dzi where asked for; returns the names written."""
+def write_panorama(
+    folder: OutputFolder, name: str, shot: CalibratedShot, config: Config, *, axes_of: int | None = None
+) -> list[str]:
+    """Stage panorama.tif, .jpg, .json and .pto of a shot, .png and .dzi where asked for; returns the names written.
+
+    axes_of: the shot whose axes the rays are in, where shots were merged.
+    """
     panorama = shot.panorama
     assert panorama is not None  # the caller asked
     world = "levelled: y along the pan axis" if shot.level.observable else "reference camera"
+    if axes_of is not None:
+        world += f", of shot {axes_of}"
     if not shot.verdict.claims_focal:
         world += "; the focal length is not known, so rays are relative to a nominal one"
     names = [f"{name}/panorama.{kind}" for kind in ("tif", "jpg", "json", "pto")]

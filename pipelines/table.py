@@ -44,12 +44,14 @@ def shot_rows(
     level: Level | None,
     fits: Iterable[PairFit],
     doubtful: Collection[int] = (),
+    log_f_ref: float | None = None,
 ) -> CameraTable:
     """camera.csv rows of one shot, a row per frame of `facts`, in their order.
 
     Frames that the solution lacks are bridged between solved neighbours (status 'interpolated') or 'lost'. Angles are
     in the levelled head frame when `level` is observable, else in the reference camera's axes. doubtful: frames whose
-    camera was taken out because no verified pair leads to it.
+    camera was taken out because no verified pair leads to it. log_f_ref: of the reference frame, where that is a frame
+    of another shot in whose axes the solution is; else it is solution.reference.
     """
     n = len(facts)
     width = solution.lens.size_px[0]
@@ -78,7 +80,8 @@ def shot_rows(
     sigma_total = np.sqrt(sigma_stat**2 + systematic**2)
     f = np.exp(log_f)
     reference = row_of.get(solution.reference)
-    log_f_ref = float(solution.log_f[reference]) if reference is not None else np.nan
+    if log_f_ref is None:
+        log_f_ref = float(solution.log_f[reference]) if reference is not None else np.nan
     zoom = np.exp(log_f - log_f_ref)
     # What frames share in px, at a quarter of the width from the middle; a shot that cannot say has at least a tenth.
     shared_px = float(np.nan_to_num(verdict.sigma_parts.get("systematic_px", 0.0)))

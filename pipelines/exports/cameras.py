@@ -156,7 +156,8 @@ def shot_cameras(
                 identity=str(clip.get("identity", "")),
                 shot=shot.index,
                 reference_frame=shot.reference_frame,
-                world=world_of(shot.calibration),
+                world=world_of(shot.calibration)
+                + ("" if shot.merged_into is None else f", of shot {shot.merged_into}"),
                 size_px=(int(clip["size_px"][0]), int(clip["size_px"][1])),
                 fps=fps,
                 picture_fps=float(clip.get("picture_fps") or fps),

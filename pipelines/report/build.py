@@ -89,6 +89,13 @@ def render(out: Path, run: RunRecord, table: CameraTable, thumbnails: Mapping[in
         clip_line=clip_line(run.clip),
         seen=words.seen(run, table),
         troubles=words.troubles(run.shots, table),
+        merging=words.merging(run.extra.get("merging") or {}),
+        merged_pictures=[
+            name
+            for group in (run.extra.get("merging") or {}).get("groups", ())
+            for name in group["files"]
+            if name.endswith("panorama.jpg")
+        ],
         shots=[shot_view(out, shot, table, thumbnails, pictures[shot.index]) for shot in run.shots],
         statuses=status_counts(table),
         signs=words.STATUS_SIGNS,
@@ -96,7 +103,7 @@ def render(out: Path, run: RunRecord, table: CameraTable, thumbnails: Mapping[in
         clip_rows=list(flat(run.clip)),
         config_rows=list(flat(run.config)),
         version_rows=list(flat(run.versions)),
-        extra_rows=list(flat(run.extra)),
+        extra_rows=list(flat({k: v for k, v in run.extra.items() if k != "merging"})),
         n_drawn=len(data["row"]),
         n_frames=len(table),
         data=script_json(data),

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,9 +246,34 @@ def found(shot: ShotRecord, facts: ShotFacts) -> str:
         parts.append(f"median residual {facts.residual_px[0]:.2f} px")
     words = (", ".join(parts) + ".") if parts else "Nothing measured."
     words = words[0].upper() + words[1:]
+    if shot.merged_into is not None:
+        words += f" Merged into shot {shot.merged_into}: one camera, angles and zoom in that shot's world."
     if shot.status != "ok":
         words += f" {why(shot)}"
     return words
+
+
+def merging(facts: Mapping[str, Any]) -> list[str]:
+    """What came of merging shots, a sentence a group and an attempt; nothing where it was not asked for."""
+    told = [
+        f"Shots {', '.join(str(i) for i in group['shots'])} are one camera: {group['folder']}, held together by "
+        f"{plural(group['pairs_across'], 'pair')} of pictures."
+        for group in facts.get("groups", ())
+    ]
+    for attempt in facts.get("attempts", ()):
+        if attempt["merged"]:
+            told.append(
+                f"Shot {attempt['shot']} was merged into shot {attempt['into']}: "
+                f"{plural(attempt['pairs_kept'], 'pair')} across, residual {number(attempt['residual_px'], 2)} px "
+                f"({number(attempt['residual_own_px'], 2)} px within the shots)."
+            )
+        elif attempt["into"] < 0:
+            told.append(f"Shot {attempt['shot']} was compared with no other. {attempt['sentence']}")
+        else:
+            told.append(
+                f"Shot {attempt['shot']} was not merged into shot {attempt['into']}. {attempt['sentence']}"
+            )
+    return told
 
 
 def why(shot: ShotRecord) -> str:

@@ -54,6 +54,7 @@ class ClipSpec:
     lens: LensSpec = field(default_factory=LensSpec)
     texture: str = "full"
     board_height_m: float = 1.6
+    camera_moved_m: tuple[float, float] = (0.0, 0.0)  # towards the pitch and up: another camera position
     max_px_per_rad: float = 5000.0
     n_players: int = 22
     player_share: float | None = 0.10
@@ -118,6 +119,7 @@ class SynthClip:
             texture=spec.texture,
             px_per_rad=min(longest, spec.max_px_per_rad),
             board_height_m=spec.board_height_m,
+            camera_moved_m=spec.camera_moved_m,
         )
         self.world = make_world(world_spec, self._shown)
         self.renderer = Renderer(world=self.world)

@@ -68,6 +68,17 @@ def make_stadium(*, arena: bool = False, board_height_m: float = 1.6) -> Stadium
     return Stadium(back, height, half_l, half_w, faces, tangents, s_start, profile, arena)
 
 
+def seen_from(stadium: Stadium, closer_m: float, up_m: float) -> Stadium:
+    """The same ground from a pan axis that stands closer to the pitch and higher: another camera position."""
+    faces, tangents = stadium.faces.copy(), stadium.tangents.copy()
+    faces[:, 2] -= closer_m * faces[:, 1]
+    tangents[:, 1] -= closer_m
+    return stadium._replace(
+        camera_back=stadium.camera_back - closer_m, camera_height=stadium.camera_height + up_m,
+        faces=faces, tangents=tangents,
+    )  # fmt: skip
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _nearest_face(stadium, dx, dy, tan_up, segment):
     """Smallest positive horizontal distance at which the ray crosses the segment's (extended) surface, and its face."""

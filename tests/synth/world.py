@@ -17,7 +17,7 @@ import numpy as np
 from tests.synth.camera import SynthCamera
 from tests.synth.goals import draw_goals
 from tests.synth.paint import paint_rows, paint_strip
-from tests.synth.stadium import Stadium, make_stadium
+from tests.synth.stadium import Stadium, make_stadium, seen_from
 
 PSF_PX = 0.6  # Gaussian sigma; MTF .17 at Nyquist, as a broadcast chain has, and no visible aliasing
 _DECIMATION_BLUR_PX = PSF_PX * np.sqrt(3.0)  # (2 PSF)^2 - PSF^2: the next level has PSF_PX of its own again
@@ -35,12 +35,14 @@ _SHIRTS = np.array(
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldSpec:
     """What to paint. texture: full, band (low texture on grass and above the lower tier) or arena. px_per_rad: texels
-    a radian of level 0. board_height_m: hoardings; 6 m cover about 10 % of a picture."""
+    a radian of level 0. board_height_m: hoardings; 6 m cover about 10 % of a picture. camera_moved_m: towards the
+    pitch and up, from where the camera stands otherwise."""
 
     seed: int = 1
     texture: str = "full"
     px_per_rad: float = 4200.0
     board_height_m: float = 1.6
+    camera_moved_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.texture not in TEXTURES:
@@ -110,6 +112,7 @@ def make_world(spec: WorldSpec, cameras: Sequence[SynthCamera]) -> World:
     lon_left, tan_top = np.floor(lon0 * s / 8) * 8 / s, np.ceil(tan1 * s / 8) * 8 / s
     w, h = int(np.ceil((lon1 - lon_left) * s)) + 1, int(np.ceil((tan_top - tan0) * s)) + 1
     stadium = make_stadium(arena=spec.texture == "arena", board_height_m=spec.board_height_m)
+    stadium = seen_from(stadium, *spec.camera_moved_m)
     rng = np.random.default_rng([spec.seed, 7])
     distance = float(stadium.faces[0, 2])
     res = min(64.0, 1.2 * s / distance)

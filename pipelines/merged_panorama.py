@@ -1,0 +1,86 @@
+"""One panorama of several shots of one camera: composed from the frames that each shot's own panorama was made of.
+
+Not from the finished panoramas: the frames go through the joint cameras, so nothing is doubled where two calibrations
+differed, exposures are levelled between all frames, and players leave where another shot shows the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mosaic.composite import Panorama, composite
+from mosaic.cropping import crop_inside
+from mosaic.framestore import FrameStore, StoredFrame
+from mosaic.surface import choose_surface
+from mosaic.views import CompositeOptions, plan_views
+from pipelines.bridge import CameraPlacement
+from pipelines.config import Config
+from pipelines.shot import MAX_PLACEMENTS_FOR_SURFACE
+
+
+class JoinedStores:
+    """The frame stores of several shots as one to read from: what `composite` asks of a FrameStore."""
+
+    def __init__(self, stores: Sequence[FrameStore]) -> None:
+        self.size_px = stores[0].size_px
+        self._of: Mapping[int, FrameStore] = {frame: store for store in stores for frame in store.frames}
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Frame numbers stored, in ascending order."""
+        return tuple(sorted(self._of))
+
+    def __contains__(self, frame: int) -> bool:
+        return frame in self._of
+
+    def get(self, frame: int, shrink: int = 1) -> StoredFrame:
+        """See FrameStore.get."""
+        return self._of[frame].get(frame, shrink)
+
+    def rows(self, frame: int, first: int, last: int, buffer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """See FrameStore.rows."""
+        return self._of[frame].rows(frame, first, last, buffer)
+
+    def trust(self, frame: int) -> NDArray[np.uint8] | None:
+        """See FrameStore.trust."""
+        return self._of[frame].trust(frame)
+
+    def still(self, frame: int) -> NDArray[np.uint8]:
+        """See FrameStore.still."""
+        return self._of[frame].still(frame)
+
+    def coarse(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """See FrameStore.coarse."""
+        return self._of[frame].coarse(frame)
+
+
+CACHE_BYTES = 200_000_000  # of all stores together, as one store has by itself
+
+
+def panorama_of(
+    stores: Sequence[FrameStore],
+    placements: Sequence[CameraPlacement],
+    config: Config,
+    scratch: Path,
+    progress: Callable[[float], None],
+) -> Panorama:
+    """The panorama of the stored frames under these placements. Raises ValueError: no stored frame has one."""
+    for store in stores:
+        store.cache_bytes = CACHE_BYTES // len(stores)
+    joined = JoinedStores(stores)
+    options = CompositeOptions(views=config.panorama.views)
+    stride = max(1, len(placements) // MAX_PLACEMENTS_FOR_SURFACE)
+    surface = choose_surface(
+        placements[::stride], config.panorama.projection, max_pixels=config.panorama.max_megapixels * 1e6
+    )
+    # Planned anew among what is stored: a place that many shots show needs no more views than any other.
+    plan = plan_views([p for p in placements if p.frame in joined], surface, options)
+    panorama = composite(
+        plan, cast(FrameStore, joined), placements, surface, options, scratch=scratch, progress=progress
+    )  # composite only reads
+    return crop_inside(panorama) if config.panorama.crop == "inside" else panorama
