@@ -20,6 +20,7 @@ from calib.parallax import Parallax
 from calib.pupil import PupilFit
 from calib.records import HomographyGraph, Priors, Solution
 from calib.refine import RefineOptions, refine
+from calib.rolling_shutter import RollingShutter
 from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairFit
@@ -92,7 +93,8 @@ class KeyframeOptions:
 class KeyframeResult:
     """The refined keyframes with the graph and options they were refined with, its fits, and the rounds it took.
 
-    pupil: what was found of a pupil's parallax, which is then out of solution and graph (not out of the fits)."""
+    pupil, readout: what was found of a pupil's parallax and of a rolling shutter, which are then out of solution and
+    graph (not out of the fits)."""
 
     solution: Solution
     graph: HomographyGraph
@@ -100,6 +102,7 @@ class KeyframeResult:
     rounds: int
     options: RefineOptions
     pupil: PupilFit | None = None
+    readout: RollingShutter | None = None
 
     @property
     def parallax(self) -> Parallax | None:

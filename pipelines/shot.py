@@ -19,7 +19,6 @@ from calib.gates import GateOptions, judge
 from calib.level import level
 from calib.parallax import Parallax
 from calib.poses import solve_poses
-from calib.pupil import without_parallax
 from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
 from mosaic.composite import Panorama, composite
@@ -42,6 +41,7 @@ from pipelines.links import contradicted_frames, without_doubtful
 from pipelines.moving import MovingFinder
 from pipelines.pupil import with_pupil
 from pipelines.pupil_facts import pupil_facts
+from pipelines.readout import readout_facts, with_readout, without_readout
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
 from pipelines.second_pass import second_pass
@@ -132,8 +132,13 @@ def solve_shot(
             options=options_k,
         )
         result = _with_central_reference(result, priors)
-        result = with_pupil(
-            result, lambda solved: register_pairs(templates, images, solved, n_levels, mask, options_k)
+
+        def register(solved: Solution) -> list[PairFit]:
+            return register_pairs(templates, images, solved, n_levels, mask, options_k)
+
+        result = with_pupil(result, register)
+        result = with_readout(
+            result, tracker.fits, register, lambda found: _poses(tracker, found, tracker.fits)
         )
         result = _with_known_focal(result, tracker, config, priors)
         shift = result.pupil.shift_log_f if result.pupil is not None else 0.0
@@ -330,8 +335,8 @@ def frame_poses(tracker: ShotTracker, result: KeyframeResult, fits: Sequence[Pai
     between = [f for f in fits if not (f.src in tracker.keyframes and f.dst in tracker.keyframes)]
     graph = homography_graph(frames, between, tracker.size_px)
     solved = solve_poses(graph, held)
-    if result.parallax is not None:
-        solved = solve_poses(without_parallax(graph, solved, result.parallax), held)
+    if result.parallax is not None or (result.readout is not None and result.readout.found):
+        solved = solve_poses(without_readout(graph, solved, result), held)
     return _with_duplicates(solved, tracker)
 
 
@@ -460,6 +465,7 @@ def calibration_facts(shot: CalibratedShot, tracker: ShotTracker) -> dict[str, A
             "rho_std_deg": float(np.degrees(head.rho_std_rad)),
         },
         "pupil": pupil_facts(shot.keyframes.pupil, head.R_head_world if head.observable else np.eye(3)),
+        "rolling_shutter": readout_facts(shot.keyframes.readout),
         "keyframes": [int(k) for k in sorted(tracker.keyframes)],
         "keyframe_pairs": len(shot.keyframes.fits),
         "keyframe_pairs_usable": sum(f.usable for f in shot.keyframes.fits),
