@@ -93,7 +93,8 @@ class CalibratedShot:
     panorama: Panorama | None
     no_panorama: str
     timings: Timings
-    fits: tuple[PairFit, ...] = ()  # that the poses were solved from
+    fits: tuple[PairFit, ...] = ()  # that the poses were solved from, with
+    steps: tuple[PairFit, ...] = ()  # frame-to-frame pairs that are not among them
     store: FrameStore | None = None  # the panorama's frames, open, where they were asked for
 
 
@@ -138,7 +139,7 @@ def solve_shot(
 
         result = with_pupil(result, register)
         result = with_readout(
-            result, tracker.fits, register, lambda found: _poses(tracker, found, tracker.fits)
+            result, tracker.fits, register, lambda found: frame_poses(tracker, found, tracker.fits)
         )
         result = _with_known_focal(result, tracker, config, priors)
         shift = result.pupil.shift_log_f if result.pupil is not None else 0.0
@@ -168,7 +169,7 @@ def solve_shot(
     with timings.measure("plan"):
         surface, plan = _plan(approximate, tracker, world, config, options, result.parallax)
     store = FrameStore(scratch, tracker.size_px)
-    done = False
+    kept = False
     try:
         with timings.measure("second pass"):
             # Only where frames lie relative to each other counts here: the axes of the reference will do.
@@ -190,15 +191,17 @@ def solve_shot(
         with timings.measure("composite"):
             fitting = replace(solution, log_f=np.where(contradicted_frames(solution), np.nan, solution.log_f))
             placements = placements_of(fitting, world, tracker.observations, tracker.size_px, result.parallax)
-            panorama = composite(
-                plan, store, placements, surface, options, scratch=scratch,
-                progress=lambda share: progress("composite", round(share * 100), 100),
-            )  # fmt: skip
-            if config.panorama.crop == "inside":
-                panorama = crop_inside(panorama)
-        done = True
+            panorama = None
+            if any(p.frame in store for p in placements):
+                panorama = composite(
+                    plan, store, placements, surface, options, scratch=scratch,
+                    progress=lambda share: progress("composite", round(share * 100), 100),
+                )  # fmt: skip
+                if config.panorama.crop == "inside":
+                    panorama = crop_inside(panorama)
+        kept = keep_frames and panorama is not None
     finally:
-        if not (keep_frames and done):
+        if not kept:
             store.close()
     rows = shot_rows(
         shot=shot,
@@ -211,8 +214,8 @@ def solve_shot(
     )
     return CalibratedShot(
         solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
-        rows=rows, panorama=panorama, no_panorama="", timings=timings, fits=tuple(fits),
-        store=store if keep_frames else None,
+        rows=rows, panorama=panorama, no_panorama="" if panorama is not None else "no frame fits its camera",
+        timings=timings, fits=tuple(fits), steps=tuple(frame_steps(tracker)), store=store if kept else None,
     )  # fmt: skip
 
 
@@ -419,7 +422,6 @@ __all__ = [
     "believed_level",
     "concatenate",
     "frame_poses",
-    "frame_steps",
     "lost_rows",
     "placements_of",
     "priors_of",
