@@ -29,6 +29,7 @@ TRUTH_COLUMNS = (
     "frame", "pts_s", "f_px", "pan_deg", "tilt_deg", "roll_deg", "cx_px", "cy_px", "aspect", "k1", "shot",
 )  # fmt: skip
 _BITRATE_1080P25 = 8e6
+_ROW_STEP_PX = 0.7  # of motion between the pictures that a rolling shutter's rows are mixed from
 _BLUR_STEP_PX = 1.5  # spacing of the sub-exposures of motion blur
 
 
@@ -39,7 +40,8 @@ class ClipSpec:
     player_share: wanted mean share of the picture's pixels (None: players of 1.8 m). led_scroll_m_s: speed of the
     hoardings' content; led_flip_s: seconds between switches (0: never). crowd_sway_m: how far people in the stands
     lean. exposure_drift: relative amplitude of a slow sine; exposure_ramp_stops: change over the shot. flicker:
-    relative amplitude from frame to frame. shutter: exposure over frame time (0: no motion blur). duplicate_every:
+    relative amplitude from frame to frame. shutter: exposure over frame time (0: no motion blur). readout: time from
+    the first row to the last over frame time (rolling shutter; the truth is the middle row's camera). duplicate_every:
     every n-th frame repeats the one before (0: none).
     crf replaces bitrate_bit_s (None: 8 Mbit/s at 1080p25, in proportion).
     """
@@ -72,6 +74,7 @@ class ClipSpec:
     flash_frame: int | None = None
     vignette: float = 0.0
     shutter: float = 0.0
+    readout: float = 0.0
     duplicate_every: int = 0
     codec: str = "libx264"
     pix_fmt: str = "yuv420p"
@@ -82,6 +85,8 @@ class ClipSpec:
     def __post_init__(self) -> None:
         if self.width % 2 or self.height % 2:
             raise ValueError(f"size {self.width}x{self.height}: 4:2:0 needs even sizes")
+        if self.shutter and self.readout:
+            raise ValueError("shutter and readout together are not rendered")
         if self.n_frames < 1:
             raise ValueError(f"n_frames {self.n_frames} < 1")
 
@@ -220,14 +225,11 @@ class SynthClip:
     def _expose_scene(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """The scene, averaged over the time that the shutter is open."""
         half = self.spec.shutter / 2
+        if self.spec.readout:
+            return self._read_by_rows(index)
         if half == 0:
             return self._scene(float(index))
-        corners = np.array(
-            [[0.0, 0.0], [self.spec.width, self.spec.height], [self.spec.width / 2, self.spec.height / 2]]
-        )
-        a, b = self.path.camera(index - half), self.path.camera(index + half)
-        smear = float(np.nanmax(np.linalg.norm(b.ray_to_pixel(a.pixel_to_ray(corners)) - corners, axis=-1)))
-        n = int(np.clip(np.ceil(smear / _BLUR_STEP_PX), 2, 24))
+        n = int(np.clip(np.ceil(self._smear_px(index, half) / _BLUR_STEP_PX), 2, 24))
         total = np.zeros((self.spec.height, self.spec.width, 3), np.float32)
         covered = np.zeros((self.spec.height, self.spec.width), np.uint8)
         for t in index + self.spec.shutter * ((np.arange(n) + 0.5) / n - 0.5):
@@ -235,6 +237,31 @@ class SynthClip:
             total += image
             covered = np.maximum(covered, cover)
         return (total / n + 0.5).astype(np.uint8), covered
+
+    def _smear_px(self, index: int, half: float) -> float:
+        """How far a corner or the centre goes within `half` a span of frame times before and after a frame."""
+        corners = np.array(
+            [[0.0, 0.0], [self.spec.width, self.spec.height], [self.spec.width / 2, self.spec.height / 2]]
+        )
+        a, b = self.path.camera(index - half), self.path.camera(index + half)
+        return float(np.nanmax(np.linalg.norm(b.ray_to_pixel(a.pixel_to_ray(corners)) - corners, axis=-1)))
+
+    def _read_by_rows(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """The scene, each row at its own time: mixed from whole pictures less than a pixel of motion apart."""
+        height, share = self.spec.height, self.spec.readout
+        n = int(np.clip(np.ceil(self._smear_px(index, share / 2) / _ROW_STEP_PX), 1, 24))
+        at = ((np.arange(height) + 0.5) / height) * n  # row by row, in steps between pictures
+        image = np.zeros((height, self.spec.width, 3), np.float32)
+        covered = np.zeros((height, self.spec.width), np.uint8)
+        for k in range(n + 1):
+            weight = np.maximum(1 - np.abs(at - k), 0).astype(np.float32)
+            rows = np.flatnonzero(weight)
+            if not len(rows):
+                continue
+            part, cover = self._scene(index + share * (k / n - 0.5))
+            image[rows] += weight[rows, None, None] * part[rows]
+            covered[rows] = np.maximum(covered[rows], cover[rows])
+        return (image + 0.5).astype(np.uint8), covered
 
 
 def _quarter(camera: SynthCamera) -> SynthCamera:

@@ -47,6 +47,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--flash", type=int, dest="flash_frame")
     p.add_argument("--vignette", type=float)
     p.add_argument("--shutter", type=float)
+    p.add_argument(
+        "--readout", type=float, help="rolling shutter: time from first to last row over frame time"
+    )
     p.add_argument("--duplicate-every", type=int)
     p.add_argument("--bitrate", type=float, dest="bitrate_bit_s")
     p.add_argument("--crf", type=float)

@@ -237,3 +237,17 @@ def test_command_line_and_presets() -> None:
     assert {name for name in PRESETS} >= {"ideal", "lens", "pure_zoom", "locked_off", "hard"}
     with pytest.raises(ValueError, match="none of"):
         preset("nonsense")
+
+
+def test_rows_of_a_rolling_shutter_are_those_of_their_own_moment() -> None:
+    spec = ClipSpec(
+        seed=3, width=320, height=180, n_frames=9, path=PathSpec(pan_deg=12, zoom=1.0), player_share=None, n_players=0,
+        scoreboard=False, logo=False, noise_grey=0.0, exposure_drift=0.0,
+    )  # fmt: skip
+    rolling, whole = SynthClip(dataclasses.replace(spec, readout=0.8)), SynthClip(spec)
+    seen = rolling.frame(4).image.astype(float)
+    for row in (20, 90, 160):
+        moment = 4 + 0.8 * ((row + 0.5) / 180 - 0.5)
+        own = whole._scene(moment)[0][row].astype(float)
+        other = whole._scene(4.0 if row != 90 else 4.3)[0][row].astype(float)
+        assert np.abs(seen[row] - own).mean() < 0.5 * np.abs(seen[row] - other).mean()
