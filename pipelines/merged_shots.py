@@ -22,7 +22,7 @@ from pipelines.merged_panorama import panorama_of
 from pipelines.merging import Group, find_groups
 from pipelines.output_folder import OutputFolder
 from pipelines.records import CameraTable, ShotRecord
-from pipelines.shot import CalibratedShot, frame_poses, frame_steps, placements_of
+from pipelines.shot import CalibratedShot, frame_poses, placements_of
 from pipelines.shot_files import pair_arrays, panorama_facts, shot_record, write_panorama
 from pipelines.table import shot_rows
 
@@ -70,17 +70,15 @@ def merge_shots(
 
 def _member(group: Group, kept: KeptShot) -> _Member:
     """The shot's frames against the group's keyframes, and their rows in the group's world."""
-    tracker, result = kept.tracker(), group.result
-    fits = kept.solved.fits
-    # Without a second pass the fits are those of the first, steps included.
-    more = frame_steps(tracker) if kept.solved.no_panorama == "" else []
-    solution = frame_poses(tracker, result, [*fits, *more])
+    result, fits = group.result, kept.solved.fits
+    solution = frame_poses(kept.tracker(), result, [*fits, *kept.solved.steps])
     # Which frames hang on verified pairs is asked within the shot: the group's reference may be in another one.
     keyframes = sorted(kept.keyframes)
     solved = {int(f) for f in result.solution.frames[np.isfinite(result.solution.log_f)]}
     own = kept.solved.keyframes.solution.reference
     local = own if own in solved else next(k for k in keyframes if k in solved)
-    solution, doubtful = without_doubtful(replace(solution, reference=local), [*result.fits, *fits])
+    keyed = [f for f in fits if f.src in kept.keyframes]
+    solution, doubtful = without_doubtful(replace(solution, reference=local), [*result.fits, *keyed])
     log_f_ref = float(result.solution.log_f[result.solution.index(result.solution.reference)])
     rows = shot_rows(
         shot=kept.index, facts=kept.facts, solution=solution, verdict=group.verdict, level=group.level, fits=fits,
@@ -103,7 +101,7 @@ def _rewrite(
     index = member.kept.index
     before, store, shot = records[index], shelf.store(index), member.solved
     facts, files = before.panorama, before.files
-    if store is not None:
+    if store is not None and any(p.frame in store for p in member.placements):
         panorama = panorama_of(
             [store], member.placements, config, scratch,
             lambda share: progress("merge", round(share * 100), 100),
@@ -136,9 +134,10 @@ def _whole(
     write_arrays(folder.stage(files[0]), pair_arrays(replace(shot, graph=graph)))
     stores = [store for i in group.members if (store := shelf.store(i)) is not None]
     facts = None
-    if stores:
+    placements = [p for m in members for p in m.placements]
+    if any(p.frame in store for p in placements for store in stores):
         panorama = panorama_of(
-            stores, [p for m in members for p in m.placements], config, scratch,
+            stores, placements, config, scratch,
             lambda share: progress("merge", round(share * 100), 100),
         )  # fmt: skip
         whole = replace(shot, panorama=panorama)
