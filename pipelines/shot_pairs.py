@@ -16,6 +16,8 @@ from mosaic.template import prepare
 from mosaic.warp import HomographyFamily
 from pipelines.kept_shots import KeptShot, ShotShelf
 
+STRUCTURE_GREY = 12.0  # local contrast (standard deviation) of letters and lines; grass has 2 to 5
+
 
 def spread(solution: Solution, frames: Sequence[int], n: int) -> list[int]:
     """Up to n of the frames, far apart in direction and zoom, the most typical one first; all that are solved, or all
@@ -62,7 +64,7 @@ def cross_pairs(
         src, dst = ours[a], theirs[b]
         shot = shots[dst]
         n_tried += 1
-        H = match_features(small[src], small[dst], shot.size_px)
+        H = match_features(*without_common(small[src], small[dst]), shot.size_px)
         if H is None:
             continue
         n_matched += 1
@@ -83,3 +85,26 @@ def scene_only(small: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDAr
     hidden = cv2.resize((~mask).astype(np.uint8), small.shape[::-1], interpolation=cv2.INTER_AREA)
     hidden = cv2.dilate((hidden > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
     return np.asarray(cv2.inpaint(small, hidden, 3, cv2.INPAINT_TELEA), np.uint8)
+
+
+def without_common(
+    a: NDArray[np.uint8], b: NDArray[np.uint8], side_px: int = 9
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two small pictures without the structure that stands at the same place of the screen in both.
+
+    A graphic that no mask knows (it had appeared for too short a time) would match itself and outvote the scene. Where
+    half of all structure stands still the camera itself looks the same way, and nothing is taken out.
+    """
+
+    def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(cv2.blur(values, (side_px, side_px)), np.float32)
+
+    x, y = a.astype(np.float32), b.astype(np.float32)
+    contrast = [np.sqrt(np.maximum(mean(v * v) - mean(v) ** 2, 0)) for v in (x, y)]
+    structured = [c > STRUCTURE_GREY for c in contrast]
+    same = structured[0] & structured[1] & (mean(np.abs(x - y)) < 0.4 * np.minimum(*contrast))
+    if not same.any() or same.sum() > 0.5 * (structured[0] | structured[1]).sum():
+        return a, b
+    hidden = cv2.dilate(same.astype(np.uint8), np.ones((side_px, side_px), np.uint8))
+    a, b = (np.asarray(cv2.inpaint(v, hidden, 3, cv2.INPAINT_TELEA), np.uint8) for v in (a, b))
+    return a, b

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -30,7 +31,7 @@ from pipelines.rays import pixel_to_ray
 from pipelines.report import words
 from pipelines.report.words import merging as words_of_merging
 from pipelines.result import open_result
-from pipelines.shot_pairs import scene_only, spread
+from pipelines.shot_pairs import scene_only, spread, without_common
 from tests.pipelines.end_to_end import Finished, run
 from tests.synth.clip import ClipSpec, truth_path, write_clip
 from tests.synth.paths import PathSpec
@@ -221,7 +222,7 @@ def test_a_resumed_run_solves_again_and_ends_the_same(
     options = ("--merge-shots", "--panorama.enabled", "false")
     whole = run(clip, tmp_path / "whole", *options)
     with monkeypatch.context() as patched:
-        patched.setattr(run_module, "merge_shots", interrupted)
+        patched.setattr(run_module, "thumbnails", interrupted)  # when the first shot has just been saved
         assert run(clip, tmp_path / "out", *options).code == 130
     assert list((tmp_path / "out").glob(".partial-*/shot-*/shot.json"))
     again = run(clip, tmp_path / "out", *options, "--resume")
@@ -284,6 +285,25 @@ def test_graphics_do_not_match_themselves() -> None:
     assert np.array_equal(without[30:], small[30:])
     assert np.std(without[6:14, 12:48].astype(float)) < 0.6 * np.std(small[6:14, 12:48].astype(float))
     assert scene_only(small, None) is small
+
+
+def test_a_graphic_that_no_mask_knows_is_taken_out_of_a_pair_of_pictures() -> None:
+    rng = np.random.default_rng(1)
+
+    def picture(text: str) -> NDArray[np.uint8]:
+        out = np.clip(rng.normal(90, 3, (180, 320)), 0, 255).astype(np.uint8)
+        cv2.putText(out, "TEAM 0-0", (20, 40), cv2.FONT_HERSHEY_DUPLEX, 1.0, 250, 2)
+        cv2.putText(out, text, (60, 130), cv2.FONT_HERSHEY_DUPLEX, 1.5, 20, 3)
+        cv2.line(out, (0, int(rng.integers(60, 90))), (319, int(rng.integers(90, 120))), 220, 3)
+        return out
+
+    a, b = picture("north"), picture("south stand")
+    for before, after in zip((a, b), without_common(a, b), strict=True):
+        assert after[18:42, 20:180].std() < 0.2 * before[18:42, 20:180].std()
+        assert np.mean(after[60:] == before[60:]) > 0.9
+    # A camera that looks the same way again: all that it sees stands still, and stays.
+    noisy = np.clip(a + rng.normal(0, 2, a.shape), 0, 255).astype(np.uint8)
+    assert all(x is y for x, y in zip(without_common(a, noisy), (a, noisy), strict=True))
 
 
 def test_stores_of_several_shots_read_as_one(tmp_path: Path) -> None:
