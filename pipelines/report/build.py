@@ -35,6 +35,8 @@ CALIBRATION_NOTES = {
     "over_height": "how far the lens's pupil lies in front of the pan axis, over the axis' height above the pitch",
     "over_stand": "the same over the distance of the stand",
     "focal_change": "what taking the pupil's parallax out did to the focal length",
+    "share_of_frame": "rolling shutter: time from reading the first row to the last, over the time between pictures",
+    "first_row_px": "rolling shutter: how far it moves the first row of the fastest picture",
     "support_rows": "rows of the picture that carry the evidence",
 }
 # What the sentence above the verdict's table says already.
