@@ -54,7 +54,8 @@ class MergeOptions:
     them; a shot of a single keyframe may bring that one if min_pairs of a shot with a known focal meet it. kept_share:
     of the pairs across the shots that the joint calibration must keep. rms_px: largest residual of the pairs across;
     rms_ratio, rms_spare_px: and no more than so many times the shots' own and a spare. focal_sigmas: of their stated
-    errors, by which the shots' own focals may differ.
+    errors, by which the shots' own focals may differ. Measured: one camera again leaves .9 to 1.5 times the shots' own
+    residual (six generator pairs, one real one), a camera 1 m closer 2.1 times, .3 m 1.7 times.
     """
 
     n_first: int = 4
@@ -64,8 +65,8 @@ class MergeOptions:
     min_keyframes: int = 2
     kept_share: float = 0.6
     rms_px: float = 1.0
-    rms_ratio: float = 2.0
-    rms_spare_px: float = 0.2
+    rms_ratio: float = 1.6
+    rms_spare_px: float = 0.1
     focal_sigmas: float = 3.0
 
 
