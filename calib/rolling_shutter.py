@@ -24,7 +24,7 @@ SIGNIFICANT = 4.0  # standard deviations
 # of another kind reach (generator clips without a read-out time: .02 at most).
 LEAST_PX, LEAST_SHARE = 0.1, 0.08
 MOST_SHARE = 1.05  # of a frame's time: more is no read-out, nor is less than none
-LEAST_EDGES = 12
+LEAST_EDGES = 6
 HUBER = 3.0
 
 
@@ -42,13 +42,14 @@ class RollingShutter:
     n_pairs: int
 
 
-def rolling_shutter(graph: HomographyGraph, solution: Solution) -> RollingShutter:
+def rolling_shutter(graph: HomographyGraph, solution: Solution, rates: Array | None = None) -> RollingShutter:
     """The read-out time that pairs of frames show, one frame number being one unit of time.
 
-    graph: measured pairs, without the parallax of a pupil if there is one. solution: the cameras of its frames, which
-    follow each other. Pairs whose frames have no solved neighbours in time are left out.
+    graph: measured pairs, without the parallax of a pupil if there is one. solution: the cameras of its frames. rates
+    (n, 4): their motion a frame, aligned with solution.frames; default its own, from frames that follow each other.
+    Pairs whose frames have no known motion are left out.
     """
-    rates = frame_rates(solution)
+    rates = frame_rates(solution) if rates is None else rates
     row = {int(f): k for k, f in enumerate(solution.frames)}
     edges = [e for e in graph.edges if e.a in row and e.b in row]
     edges = [e for e in edges if np.isfinite(rates[[row[e.a], row[e.b]]]).all()]

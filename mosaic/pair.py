@@ -243,7 +243,7 @@ def _both_ways(
 ) -> tuple[PairFit, int]:
     """The fit, weak if b to a, started from its inverse, does not lead back; and the steps that took."""
     levels = [i for i in (1, 0) if _n_pixels(reverse, i) >= options.estimator.min_pixels]
-    if not levels:
+    if not levels or options.symmetric_px is None:
         return fit, 0
     back, _ = align(
         reverse, source, normalise_homography(np.linalg.inv(fit.H_dst_src)), dst=0, levels=levels,

@@ -6,8 +6,8 @@ parameters without knowing a focal length), edges out of pair fits, and placemen
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba as nb
@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib import rotation
 from calib.parallax import Parallax
-from calib.records import HomographyEdge, HomographyGraph, Lens
+from calib.records import HomographyEdge, HomographyGraph, Lens, Solution
+from calib.rolling_shutter import frame_rates
 from mosaic.records import PairFit
+from mosaic.template import PreparedTemplate
 
 FloatArray = NDArray[np.float64]
 
@@ -222,6 +224,68 @@ class RotationZoomFamily:
             state.log_f + float(min(max(step[0], -0.3), 0.3)),
             _turned(np.ascontiguousarray(state.R_dst_src), np.ascontiguousarray(step[1:])),
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RollingFamily:
+    """Rotation + zoom of two cameras that turn while their rows are read, one after the other.
+
+    A pair registered through a warp without that keeps a part of it as its own (real-footage.md 6.3: measurements are
+    pulled to the model). share: of a frame's time, from the first row to the last; rate_src, rate_dst (4,): change of
+    log f and left rotation increment a frame. States are the cameras of the middle rows. First order in the rates.
+    """
+
+    base: RotationZoomFamily
+    share: float
+    rate_src: FloatArray
+    rate_dst: FloatArray
+    n_parameters: int = 4
+
+    def prepare(self, src_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """RotationZoomFamily.prepare of where the points would be if all rows were read with the middle one."""
+        itself = PairState(self.base.log_f_src, np.eye(3))
+        _, J, _ = self.base.warp(itself, self.base.prepare(src_px))
+        return self.base.prepare(src_px - self._moved(src_px, J, self.rate_src))
+
+    def warp(self, state: PairState, prepared: Any) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
+        """See mosaic.warp.WarpFamily.warp."""
+        dst, J, A = self.base.warp(state, prepared)
+        return dst + self._moved(dst, J, self.rate_dst), J, A
+
+    def update(self, state: PairState, step: FloatArray) -> PairState:
+        """See RotationZoomFamily.update."""
+        return self.base.update(state, step)
+
+    def _moved(self, at_px: FloatArray, J: NDArray[np.float32], rate: FloatArray) -> FloatArray:
+        late = self.share * ((at_px[:, 1:] + 0.5) / self.base.lens.size_px[1] - 0.5)
+        return np.asarray((J @ rate) * late, np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rolling:
+    """A shot's rolling shutter as registration wants it: share of a frame's time, and rates (4,) by frame number."""
+
+    share: float
+    rates: Mapping[int, FloatArray]
+
+    def seen(self, source: PreparedTemplate, dst: int) -> PreparedTemplate:
+        """A template bound to `family` as it is registered to frame dst."""
+        family = source.family
+        if not isinstance(family, RollingFamily) or dst not in self.rates:
+            return source
+        return replace(source, family=replace(family, rate_dst=self.rates[dst]))
+
+    def family(self, base: RotationZoomFamily, src: int) -> RotationZoomFamily | RollingFamily:
+        """The family of pairs from frame src; a frame without known motion is taken to stand still."""
+        rate = self.rates.get(src, np.zeros(4))
+        return RollingFamily(base=base, share=self.share, rate_src=rate, rate_dst=np.zeros(4))
+
+
+def rolling_of(share: float, track: Solution) -> Rolling:
+    """For registration, from the cameras of all frames."""
+    rates = frame_rates(track)
+    known = np.isfinite(rates).all(axis=1)
+    return Rolling(share=share, rates=dict(zip(track.frames[known].tolist(), rates[known], strict=True)))
 
 
 def pair_state(src: CameraPose, dst: CameraPose) -> PairState:

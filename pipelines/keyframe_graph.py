@@ -25,7 +25,7 @@ from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairFit
 from mosaic.template import Template, prepare
-from pipelines.bridge import CameraPose, RotationZoomFamily, homography_graph, pair_state
+from pipelines.bridge import CameraPose, Rolling, RotationZoomFamily, homography_graph, pair_state
 
 log = logging.getLogger(__name__)
 
@@ -227,14 +227,17 @@ def register_pairs(
     n_levels: int,
     mask: NDArray[np.bool_] | None,
     options: KeyframeOptions,
+    rolling: Rolling | None = None,
 ) -> list[PairFit]:
-    """Every keyframe to earlier ones that see the same view, through the solution's lens, from its cameras."""
+    """Every keyframe to earlier ones that see the same view, through the solution's lens, from its cameras.
+
+    rolling: of the shot's shutter, if there is one."""
     poses = {frame: pose for frame in templates if (pose := pose_of(solution, frame)) is not None}
     width = solution.lens.size_px[0]
-    prepared = {
-        frame: prepare(templates[frame], RotationZoomFamily(lens=solution.lens, log_f_src=pose.log_f))
-        for frame, pose in poses.items()
-    }
+    prepared = {}
+    for frame, pose in poses.items():
+        family = RotationZoomFamily(lens=solution.lens, log_f_src=pose.log_f)
+        prepared[frame] = prepare(templates[frame], rolling.family(family, frame) if rolling else family)
     fits = []
     for b in sorted(poses):
         near = sorted((distance_in_widths(poses[a], poses[b], width), a) for a in poses if a < b)
@@ -247,7 +250,7 @@ def register_pairs(
         levels = (2, 1, 0) if len(target.levels) > 2 else None
         for _, a in near:
             fit, _ = align(
-                prepared[a],
+                rolling.seen(prepared[a], b) if rolling else prepared[a],
                 target,
                 pair_state(poses[a], poses[b]),
                 dst=b,

@@ -16,7 +16,7 @@ from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid
 from mosaic.records import PairFit
 from mosaic.template import PreparedTemplate, prepare
-from pipelines.bridge import CameraPose, RotationZoomFamily, pair_state
+from pipelines.bridge import CameraPose, Rolling, RotationZoomFamily, pair_state
 from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import distance_in_widths
 from pipelines.tracking import ShotTracker
@@ -30,13 +30,13 @@ SECOND = 2.0
 @dataclass(slots=True, eq=False)
 class Retracker:
     """Registers a shot's frames against its keyframes with held cameras. `approximate` has a pose for every frame.
-
-    Safe to use from several threads."""
+    rolling: of the shot's shutter, if there is one. Safe to use from several threads."""
 
     tracker: ShotTracker
     approximate: Solution
     options: RegistrationOptions
     register_options: RegisterOptions = field(default_factory=RegisterOptions)
+    rolling: Rolling | None = None
     _row: dict[int, int] = field(init=False)
     _prepared: dict[int, PreparedTemplate] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -64,7 +64,7 @@ class Retracker:
             if key_pose is None:
                 continue
             fit, _ = align(
-                self._bound(index, key_pose),
+                self._bound(index, key_pose, frame),
                 pyramid,
                 pair_state(key_pose, pose),
                 dst=frame,
@@ -75,14 +75,16 @@ class Retracker:
             fits.append(fit)
         return fits
 
-    def _bound(self, index: int, pose: CameraPose) -> PreparedTemplate:
+    def _bound(self, index: int, pose: CameraPose, frame: int) -> PreparedTemplate:
         with self._lock:
             if index not in self._prepared:
                 if len(self._prepared) > 24:
                     self._prepared.pop(next(iter(self._prepared)))
-                family = RotationZoomFamily(lens=self.approximate.lens, log_f_src=pose.log_f)
+                plain = RotationZoomFamily(lens=self.approximate.lens, log_f_src=pose.log_f)
+                family = plain if self.rolling is None else self.rolling.family(plain, index)
                 self._prepared[index] = prepare(self.tracker.keyframes[index].template, family)
-            return self._prepared[index]
+            bound = self._prepared[index]
+        return bound if self.rolling is None else self.rolling.seen(bound, frame)
 
     def _nearest(self, frame: int, pose: CameraPose) -> list[tuple[float, int]]:
         """(displacement in widths, keyframe), nearest first; at least `min_overlap` of the picture in common."""

@@ -27,7 +27,7 @@ from mosaic.framestore import FrameStore
 from mosaic.records import MotionGraph, PairFit
 from mosaic.surface import Surface, choose_surface
 from mosaic.views import CompositeOptions, ViewPlan, plan_views
-from pipelines.bridge import CameraPlacement, CameraPose, homography_graph
+from pipelines.bridge import CameraPlacement, CameraPose, Rolling, homography_graph, rolling_of
 from pipelines.config import Config
 from pipelines.decode import Frame
 from pipelines.keyframe_graph import (
@@ -134,8 +134,8 @@ def solve_shot(
         )
         result = _with_central_reference(result, priors)
 
-        def register(solved: Solution) -> list[PairFit]:
-            return register_pairs(templates, images, solved, n_levels, mask, options_k)
+        def register(solved: Solution, rolling: Rolling | None = None) -> list[PairFit]:
+            return register_pairs(templates, images, solved, n_levels, mask, options_k, rolling)
 
         result = with_pupil(result, register)
         result = with_readout(
@@ -177,9 +177,13 @@ def solve_shot(
                 approximate, np.eye(3), tracker.observations, tracker.size_px, result.parallax
             )
             planned = set(plan.frames)
+            found = result.readout
             fits = second_pass(
                 frames(),
-                Retracker(tracker, approximate, config.registration, tracker.register_options),
+                Retracker(
+                    tracker, approximate, config.registration, tracker.register_options,
+                    rolling=rolling_of(found.share, approximate) if found is not None and found.found else None,
+                ),
                 MovingFinder({p.frame: p for p in placed}, planned, store, tracker.screen_mask),
                 store,
                 planned=planned, mask=mask, stays=tracker.screen_mask, n_levels=n_levels,
