@@ -46,7 +46,7 @@ PLAIN_GREY = 16.0  # usual distance from the ground round about, above which tha
 HALO, LIFTED = 8, 150  # trust close round what moves; and there where the colour is that of the plain ground
 NEAR, NEAR_AREA_PX = 100, 30  # trust about a body, and small px of the least piece taken for one
 CONTESTED = 0.0002  # share of the surface corrected in a round, from which another round is worth its time
-MORE_ROUNDS = 2
+MORE_ROUNDS = 0  # two gain .5 dB where players cover 25 % of the picture, and take 60 % longer
 AGREE = 0.8 * 255  # support from which views are taken to agree
 STEP_PX = 16  # spacing of exact map points in the small frame
 

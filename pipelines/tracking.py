@@ -43,6 +43,8 @@ RESTING_PX, MOVING_PX = (
     0.5,
     1.0,
 )  # motion of the centre: none, if that is true; and surely some, if it was predicted
+# A prediction that missed the last frame by less than a px of this level is looked for on it and finer ones only.
+NEAR_LEVEL, NEAR_PX = 2, 4.0
 SCREEN_LATE = 12  # frames after a graphic's appearance within which the votes find it
 MAX_LINKS = 6  # earlier keyframes that a new one is registered to: nearest and farthest by predicted overlap
 
@@ -118,6 +120,7 @@ class ShotTracker:
     _H_previous_keyframe: FloatArray = field(default_factory=lambda: np.eye(3))
     _H_step: FloatArray = field(default_factory=lambda: np.eye(3))
     _velocity: tuple[float, FloatArray] = field(default_factory=lambda: (0.0, np.eye(3)))
+    _missed_px: float = np.inf  # by how much the last prediction missed the centre
     _changes: deque[float] = field(default_factory=lambda: deque(maxlen=25))
     _n_chained: int = 0
     _chain: PairFit | None = (
@@ -266,14 +269,18 @@ class ShotTracker:
         family = RotationZoomFamily(lens=lens, log_f_src=self._pose.log_f)
         source = prepare(self._previous.template, family)
         coarse = self._coarse_levels(pyramid)
-        fit, state = align(
-            source,
-            pyramid,
-            pair_state(self._pose, predicted),
-            dst=frame,
-            levels=coarse,
-            options=self.register_options,
-        )
+        near = tuple(i for i in coarse if i <= NEAR_LEVEL) if self._missed_px < NEAR_PX else coarse
+        for levels in (near, coarse) if near != coarse else (coarse,):
+            fit, state = align(
+                source,
+                pyramid,
+                pair_state(self._pose, predicted),
+                dst=frame,
+                levels=levels,
+                options=self.register_options,
+            )
+            if fit.status == PairStatus.OK:
+                break
         if not fit.usable:
             fit, state = align(
                 source, pyramid, pair_state(self._pose, self._pose), dst=frame, levels=coarse, route="still"
@@ -319,8 +326,11 @@ class ShotTracker:
         if fit.usable:
             # Velocity from the frame-to-frame estimate alone: keyframe corrections are no motion (real-footage.md 7.5).
             self._velocity = (state.log_f - self._pose.log_f, state.R_dst_src)
+            found = pose_from_state(self._pose, state)
+            self._missed_px = self.size_px[0] * distance_in_widths(predicted, found, self.size_px[0])
         elif key_fit.usable:
             self._velocity = (0.0, np.eye(3))
+            self._missed_px = np.inf
         return fit.usable or key_fit.usable
 
     def _beyond_graphics(
