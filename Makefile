@@ -7,7 +7,8 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 # What pip installs for torch, before the project, so that nothing else picks a build. Where torch comes from is pip's
 # configuration: the README says how to get a CPU or a GPU build.  make demo TORCH=torch==2.12.0
 TORCH ?= torch==2.13.0
-PYTEST_ARGS ?=
+# Two workers; whole files go to one of them, because a file's tests share what it has set up. PYTEST_ARGS= for one.
+PYTEST_ARGS ?= -n 2 --dist loadfile
 
 BIN := .venv/bin
 STAMP := .venv/.installed
