@@ -39,7 +39,7 @@ class CompositeOptions:
     max_candidates: frames looked at when planning; a longer clip is thinned, the least blurred of each group stays.
     """
 
-    views: int = 15
+    views: int = 17
     tile_px: int = 512
     finer: float = 1.3
     min_span: int = 100

@@ -294,7 +294,7 @@ class PanoramaOptions(Section):
         default="none", description="inside = cut to the largest rectangle that was seen without a gap"
     )
     views: int = Field(
-        default=15,
+        default=17,
         ge=3,
         le=99,
         description=(

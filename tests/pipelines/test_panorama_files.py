@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import time
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -23,6 +24,7 @@ from pipelines.exports.panorama_json import read_surface, write_panorama_json
 from pipelines.exports.panorama_png import write_panorama_png
 from pipelines.exports.panorama_tiff import halve, write_panorama_tiff
 from pipelines.exports.pto import PtoFrame, hugin_lens, image_line, panorama_line, write_pto
+from pipelines.exports.srgb import srgb_profile
 from pipelines.exports.whole_file import whole_file
 from tests.mosaic.pinhole import Pinhole, sweep
 
@@ -76,6 +78,13 @@ def test_tiff_and_jpeg_are_tagged_srgb(tmp_path):
         tags = [tif.pages[0].iccprofile, jpeg.info["icc_profile"]]
     for tag in tags:
         assert "sRGB" in ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(tag)))
+
+
+def test_the_colour_tag_does_not_tell_the_time():
+    first = srgb_profile()
+    srgb_profile.cache_clear()
+    time.sleep(1.1)  # the header's date counts seconds
+    assert srgb_profile() == first
 
 
 def test_unseen_black_does_not_darken_the_reduced_levels(tmp_path):

@@ -198,6 +198,8 @@ def test_a_stabilised_clip_stands_still(
     for new in decoded(tmp_path / "still.mp4"):
         gray = cv2.cvtColor(new, cv2.COLOR_RGB2GRAY).astype(np.float32)
         for box in (np.s_[60:150, 240:340], np.s_[60:150, 340:440], np.s_[50:110, 210:430]):  # in every frame
+            if (gray[box] < 2).mean() > 0.02:  # not seen in this frame: nothing to compare
+                continue
             tried += 1
             if (shift := shift_px(clean[box], gray[box])) is not None:
                 shifts.append(shift)
