@@ -56,10 +56,8 @@ def align(
     )  # fmt: skip
     for index in levels:
         pair.index = index
-        if index in (
-            levels[0],
-            levels[-1],
-        ):  # from coarse values whatever the level: in between nothing is new
+        # From coarse values whatever the level: in between nothing is new.
+        if index in (levels[0], levels[-1]):
             pair.gain, pair.offset = _gain(pair, state)
         coarsest = index == levels[0] and len(levels) > 1 and index >= 2
         stop = options.stop_sigmas if index == levels[-1] else options.stop_sigmas_coarse

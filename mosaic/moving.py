@@ -45,8 +45,6 @@ GROUND_PX, GROUND_SHRINK = (
 PLAIN_GREY = 16.0  # usual distance from the ground round about, above which that is no plain ground
 HALO, LIFTED = 8, 150  # trust close round what moves; and there where the colour is that of the plain ground
 NEAR, NEAR_AREA_PX = 100, 30  # trust about a body, and small px of the least piece taken for one
-CONTESTED = 0.0002  # share of the surface corrected in a round, from which another round is worth its time
-MORE_ROUNDS = 0  # two gain .5 dB where players cover 25 % of the picture, and take 60 % longer
 AGREE = 0.8 * 255  # support from which views are taken to agree
 STEP_PX = 16  # spacing of exact map points in the small frame
 
@@ -69,9 +67,8 @@ def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.
     everywhere = np.full((1, 1), 255, np.uint8)
     known: Planes = [everywhere] * len(scene.views) if scene.still is None else list(scene.still)
     still = scene.still
-    done, most = 0, scene.options.motion_rounds
     with ThreadPoolExecutor(scene.options.threads) as pool:
-        while done < most:
+        for _ in range(scene.options.motion_rounds):
             layers = paint(replace(small, still=still), Canvas(tempfile.gettempdir(), 1 << 30))
 
             ground = _surroundings(layers)
@@ -94,9 +91,6 @@ def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.
 
             planes = list(pool.map(judge, range(len(scene.views))))
             still, known = tuple(plane for plane, _ in planes), [corrected for _, corrected in planes]
-            done += 1
-            if done == scene.options.motion_rounds and correction.accepted.mean() > CONTESTED:
-                most += MORE_ROUNDS
     assert still is not None
     return still, _quiet(layers, scene.options, shrink)
 
