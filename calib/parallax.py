@@ -43,7 +43,7 @@ class Parallax:
     def from_pupil(self, rays: ArrayLike, axis: ArrayLike) -> Array:
         """Directions (..., 3), not unit, from the pupil to what the pan axis sees along `rays` (..., 3).
 
-        axis (3,): the camera's optical axis, unit, in the axes of the rays.
+        axis (3,) or (..., 3): the camera's optical axis, unit, in the axes of the rays.
         """
         rays = np.asarray(rays, float)
         near = self.nearness(rays @ self.R_head_world.T)
@@ -52,12 +52,14 @@ class Parallax:
     def from_axis(self, rays: ArrayLike, axis: ArrayLike) -> Array:
         """Unit directions (..., 3) from the pan axis to what the pupil sees along rays (..., 3): from_pupil undone."""
         seen = np.asarray(rays, float) @ self.R_head_world.T
-        pupil = self.R_head_world @ np.asarray(axis, float)
+        pupil = np.asarray(axis, float) @ self.R_head_world.T
         with np.errstate(divide="ignore", invalid="ignore"):
-            to_pitch = np.where(seen[..., 1] > 0, (1 / self.over_height - pupil[1]) / seen[..., 1], np.inf)
+            to_pitch = np.where(
+                seen[..., 1] > 0, (1 / self.over_height - pupil[..., 1]) / seen[..., 1], np.inf
+            )
             a = seen[..., 0] ** 2 + seen[..., 2] ** 2
-            b = pupil[0] * seen[..., 0] + pupil[2] * seen[..., 2]
-            c = pupil[0] ** 2 + pupil[2] ** 2 - 1 / self.over_stand**2
+            b = pupil[..., 0] * seen[..., 0] + pupil[..., 2] * seen[..., 2]
+            c = pupil[..., 0] ** 2 + pupil[..., 2] ** 2 - 1 / self.over_stand**2
             to_stand = np.where(a > 0, (np.sqrt(b * b - a * c) - b) / a, np.inf)
         point = pupil + np.minimum(to_pitch, to_stand)[..., None] * seen
         return (point / np.linalg.norm(point, axis=-1, keepdims=True)) @ self.R_head_world

@@ -142,9 +142,15 @@ def without_rolling_shutter(
 
 
 def frame_rates(solution: Solution) -> Array:
+    """`motion_rates` of a solution's frames."""
+    return motion_rates(solution.frames, solution.log_f, solution.R)
+
+
+def motion_rates(frames: NDArray[np.int64], log_f: Array, R: Array) -> Array:
     """(n, 4) change of log f and left rotation increment a frame, from the frames before and after (at an end or beside
-    a gap from one of them); NaN without a solved neighbour. Repeated or missing numbers count as gaps."""
-    frames, log_f, R = solution.frames, solution.log_f, solution.R
+    a gap from one of them); NaN without a solved neighbour. Repeated or missing numbers count as gaps.
+
+    frames (n,) rising numbers; log_f (n,), NaN where a frame has no camera; R (n, 3, 3), world to camera."""
     n = len(frames)
     rates = np.full((n, 4), np.nan)
     solved = np.isfinite(log_f)

@@ -36,6 +36,21 @@ def exp(vectors: ArrayLike) -> Array:
     return np.eye(3) + sine * cross + cosine * (cross @ cross)
 
 
+def turned(points: ArrayLike, vectors: ArrayLike) -> Array:
+    """Points (..., 3) turned by rotation vectors (..., 3) rad: exp(vectors) @ points, without the matrices.
+
+    The shapes broadcast.
+    """
+    v, w = np.asarray(points, float), np.asarray(vectors, float)
+    angle2 = np.sum(w * w, -1, keepdims=True)
+    small = angle2 < 1e-8
+    safe = np.where(small, 1.0, np.sqrt(angle2))
+    sine = np.where(small, 1 - angle2 / 6, np.sin(safe) / safe)
+    cosine = np.where(small, 0.5 - angle2 / 24, 2 * np.sin(safe / 2) ** 2 / (safe * safe))
+    across = np.cross(w, v)
+    return np.asarray(v + sine * across + cosine * np.cross(w, across))
+
+
 def log(rotations: ArrayLike) -> Array:
     """Rotation vectors (..., 3) rad of rotation matrices (..., 3, 3); angle in [0, pi], exact also near pi."""
     R = np.asarray(rotations, float)

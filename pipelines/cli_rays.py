@@ -15,6 +15,7 @@ from pipelines.csv_output import write_csv
 from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError
 
 if TYPE_CHECKING:
+    from pipelines.frame_geometry import FrameGeometry
     from pipelines.records import CameraTable
 
 COLUMNS = ("frame", "x_px", "y_px", "pan_deg", "tilt_deg", "ray_x", "ray_y", "ray_z", "axis_angle_std_deg")
@@ -39,7 +40,8 @@ def rays(
 ) -> int:
     """Where a pixel of a frame looks: ray, pan and tilt in the shot's world; and which pixel sees a direction."""
     refuse_settings(context, "rays")
-    from pipelines.archive import read_camera_csv
+    from pipelines.archive import read_camera_csv, read_run
+    from pipelines.frame_geometry import frame_geometry
 
     if (points is None) == (frame is None):
         raise typer.BadParameter("give --points FILE, or --frame N with --pixel X,Y or --pan-tilt PAN,TILT")
@@ -47,15 +49,16 @@ def rays(
         raise typer.BadParameter("--points takes its pixels from the file")
     if frame is not None and not pixel and not pan_tilt:
         raise typer.BadParameter("--frame needs --pixel X,Y or --pan-tilt PAN,TILT")
-    table = read_camera_csv(out / "camera.csv")
+    run, table = read_run(out), read_camera_csv(out / "camera.csv")
+    geometry = frame_geometry(run, table)
     if points is not None:
-        rows = answer(table, *read_points(points), str(points))
+        rows = answer(table, *read_points(points), str(points), geometry)
     else:
         rows = []
         for texts, columns, option in ((pixel, FORWARD, "--pixel"), (pan_tilt, BACK, "--pan-tilt")):
             if texts:
                 pairs = [_pair(text, option) for text in texts]
-                rows += answer(table, columns, [frame or 0] * len(pairs), pairs, "--frame")
+                rows += answer(table, columns, [frame or 0] * len(pairs), pairs, "--frame", geometry)
     unknown = [row for row in rows if row["x_px"] is None or row["ray_x"] is None]
     code = EXIT_SHOTS_FAILED if unknown and len(unknown) == len(rows) else EXIT_OK
     if unknown:
@@ -73,6 +76,7 @@ def answer(
     frames: Sequence[int],
     pairs: Sequence[tuple[float, float]],
     source: str,
+    geometry: FrameGeometry | None = None,
 ) -> list[dict[str, Any]]:
     """A row of COLUMNS per point; None where it is not known. columns: FORWARD or BACK, what the pairs are.
 
@@ -85,9 +89,9 @@ def answer(
 
     given, at = np.array(pairs, float).reshape(-1, 2), np.array(frames, np.int64)
     try:
-        xy = given if tuple(columns) == FORWARD else pan_tilt_to_pixel(table, at, given)
-        angles = pixel_to_pan_tilt(table, at, given) if tuple(columns) == FORWARD else given
-        ray, std = pixel_to_ray(table, at, xy), axis_angle_std_deg(table, at, xy)
+        xy = given if tuple(columns) == FORWARD else pan_tilt_to_pixel(table, at, given, geometry)
+        angles = pixel_to_pan_tilt(table, at, given, geometry) if tuple(columns) == FORWARD else given
+        ray, std = pixel_to_ray(table, at, xy, geometry), axis_angle_std_deg(table, at, xy)
     except ValueError as error:
         cause = str(error)
         raise InputError(source, cause, f"the run has frames {table.frame[0]} to {table.frame[-1]}") from None

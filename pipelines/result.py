@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mosaic.surface import Surface
     from pipelines.exports.exporter import Exported
     from pipelines.exports.formats import ExportOptions
+    from pipelines.frame_geometry import FrameGeometry
 
 FloatArray = NDArray[np.float64]
 
@@ -137,17 +138,26 @@ class Result:
         c = self.camera
         return from_pan_tilt_roll(*np.radians([c.pan_deg, c.tilt_deg, c.roll_deg]))
 
+    def geometry(self) -> FrameGeometry:
+        """What camera.csv does not say of its frames: rows read at different times, a pupil before the pan axis.
+
+        The methods below use it; K and R above are those of a frame's middle row.
+        """
+        from pipelines.frame_geometry import frame_geometry
+
+        return frame_geometry(self.run, self.camera)
+
     def pixel_to_ray(self, frame: ArrayLike, xy_px: ArrayLike) -> FloatArray:
         """Unit rays (..., 3) of pixels (..., 2) of frames (...): see rays.pixel_to_ray."""
-        return rays.pixel_to_ray(self.camera, frame, xy_px)
+        return rays.pixel_to_ray(self.camera, frame, xy_px, self.geometry())
 
     def ray_to_pixel(self, frame: ArrayLike, directions: ArrayLike) -> FloatArray:
         """Pixels (..., 2) of directions (..., 3) in frames (...): see rays.ray_to_pixel."""
-        return rays.ray_to_pixel(self.camera, frame, directions)
+        return rays.ray_to_pixel(self.camera, frame, directions, self.geometry())
 
     def pixel_to_pan_tilt(self, frame: ArrayLike, xy_px: ArrayLike) -> FloatArray:
         """Pan and tilt (..., 2) in degrees of pixels (..., 2) of frames (...)."""
-        return rays.pixel_to_pan_tilt(self.camera, frame, xy_px)
+        return rays.pixel_to_pan_tilt(self.camera, frame, xy_px, self.geometry())
 
     # ---- files
 

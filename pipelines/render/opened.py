@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.parallax import Parallax
 from pipelines.archive import read_camera_csv, read_run
 from pipelines.config import DecodeOptions
 from pipelines.decode import Clip, open_clip
 from pipelines.errors import InputError, UserError
-from pipelines.pupil_facts import parallax_of
+from pipelines.frame_geometry import FrameGeometry, frame_geometry
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.render.views import View, frame_view, homography_view
 from pipelines.report.words import reason_words
@@ -21,12 +20,13 @@ from pipelines.report.words import reason_words
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OpenedRun:
-    """A run in folder `out`. rows: frame number to row of `table`."""
+    """A run in folder `out`. rows: frame number to row of `table`; geometry: what the table does not say of them."""
 
     out: Path
     record: RunRecord
     table: CameraTable
     rows: dict[int, int]
+    geometry: FrameGeometry
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -52,14 +52,9 @@ class OpenedRun:
         return [int(row) for row in np.flatnonzero(self.table.shot == index)]
 
     def view(self, row: int) -> View | None:
-        """The camera of a row, None where it has none."""
-        shot = int(self.table.shot[row])
-        return frame_view(self.table, row, self.size_px, self._parallax(shot) if shot >= 0 else None)
-
-    def _parallax(self, shot: int) -> Parallax | None:
-        """Of the pupil of a shot's camera: panorama and pitch are seen from the pan axis, frames from the pupil."""
-        record = next((r for r in self.record.shots if r.index == shot), None)
-        return None if record is None else parallax_of(record.calibration)
+        """The camera of a row, None where it has none. Panorama and pitch are seen from the pan axis, frames from the
+        pupil, and their rows one after the other where the shot has a rolling shutter."""
+        return frame_view(self.table, row, self.size_px, self.geometry)
 
     def shot_views(self, index: int) -> dict[int, View]:
         """Row to view of every frame of a shot that has a camera.
@@ -108,8 +103,9 @@ def open_run(out: str | Path) -> OpenedRun:
     if not record.clip.get("size_px"):
         raise InputError(folder / "run.json", "does not say how large the pictures are", "run again")
     return OpenedRun(
-        out=folder, record=record, table=table, rows={int(f): i for i, f in enumerate(table.frame)}
-    )
+        out=folder, record=record, table=table, rows={int(f): i for i, f in enumerate(table.frame)},
+        geometry=frame_geometry(record, table),
+    )  # fmt: skip
 
 
 def open_its_clip(run: OpenedRun, elsewhere: Path | None = None) -> Clip:

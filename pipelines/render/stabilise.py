@@ -106,7 +106,7 @@ def target_views(
         reference = run.rows.get(run.shot(index).reference_frame, -1)
         # The reference frame has a camera unless it was taken out as doubtful: then the nearest one holds still.
         row = min(rows, key=lambda r: abs(r - reference))
-        held = views[row].scaled(options.zoom)
+        held = views[row].still().scaled(options.zoom)
         return dict.fromkeys(rows, held)
     t = run.table
     columns = np.stack(

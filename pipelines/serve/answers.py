@@ -17,6 +17,7 @@ from mosaic.surface import Surface
 from pipelines.archive import read_camera_csv, read_run
 from pipelines.errors import InputError
 from pipelines.exports.panorama_json import read_surface
+from pipelines.frame_geometry import frame_geometry
 from pipelines.rays import pixel_to_ray, ray_to_pan_tilt, ray_to_pixel
 from pipelines.report.build import clip_line, clip_name
 from pipelines.report.words import STATUS_SIGNS
@@ -36,6 +37,7 @@ class ServedRun:
         if not self.run.clip.get("size_px"):
             raise InputError(out / "run.json", "does not say how large the pictures are", "run again")
         self.size_px = (int(self.run.clip["size_px"][0]), int(self.run.clip["size_px"][1]))
+        self.geometry = frame_geometry(self.run, self.table)
         self.tiles: dict[int, Tiles] = {}
         self.surfaces: dict[int, Surface] = {}
         for shot in self.run.shots:
@@ -86,7 +88,7 @@ class ServedRun:
         pan, tilt = ray_to_pan_tilt(ray)
         rows = np.flatnonzero((self.table.shot == shot) & np.isfinite(self.table.f_px))
         frames = self.table.frame[rows]
-        xy = ray_to_pixel(self.table, frames, ray) if len(rows) else np.zeros((0, 2))
+        xy = ray_to_pixel(self.table, frames, ray, self.geometry) if len(rows) else np.zeros((0, 2))
         w, h = self.size_px
         with np.errstate(invalid="ignore"):
             inside = ((xy > -0.5) & (xy < [w - 0.5, h - 0.5])).all(axis=-1)
@@ -132,11 +134,12 @@ class ServedRun:
             "thumbnail": self._nearest_thumbnail(number, shot),
         }
         if np.isfinite(self.table.f_px[row]):
-            outline = surface.ray_to_pixel(pixel_to_ray(self.table, number, _border(*self.size_px)))
+            border = pixel_to_ray(self.table, number, _border(*self.size_px), self.geometry)
+            outline = surface.ray_to_pixel(border)
             if np.isfinite(outline).all():
                 answer["outline"] = np.round(outline, 1).tolist()
             if x is not None and y is not None and np.isfinite([x, y]).all():
-                seen = ray_to_pixel(self.table, number, surface.pixel_to_ray([x, y]))
+                seen = ray_to_pixel(self.table, number, surface.pixel_to_ray([x, y]), self.geometry)
                 answer["pixel"] = np.round(seen, 2).tolist() if np.isfinite(seen).all() else None
         return answer
 

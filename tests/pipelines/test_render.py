@@ -60,6 +60,26 @@ def true_camera(truth_table: dict[str, Any], i: int) -> SynthCamera:
     )  # fmt: skip
 
 
+def disc_slips(new: np.ndarray, old: np.ndarray, wanted_px: np.ndarray) -> list[np.ndarray]:
+    """Centres of white discs in a rendered frame, less where they should be (n, 2); those near the border left out.
+
+    new, old: luma with and without them.
+    """
+    slips = []
+    y, x = np.mgrid[-12:13, -12:13]
+    for wanted in wanted_px:
+        if not ((wanted > 20) & (wanted < [SIZE[0] - 20, SIZE[1] - 20])).all():
+            continue
+        cx, cy = np.round(wanted).astype(int)
+        box = (slice(cy - 12, cy + 13), slice(cx - 12, cx + 13))
+        # The share of white, whatever is behind it: the plain difference would lean to one side.
+        weight = (new[box].astype(float) - old[box]) / np.maximum(255.0 - old[box], 5.0)
+        weight[weight < 0.15] = 0  # what the encoder did elsewhere
+        found = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum() + [cx, cy]
+        slips.append(found - wanted)
+    return slips
+
+
 def corner_words(corners: np.ndarray) -> str:
     return " ".join(f"{x:g},{y:g}" for x, y in corners)
 
@@ -93,21 +113,11 @@ def test_an_overlay_sticks_to_the_scene(
     H = cv2.getPerspectiveTransform(outer.astype(np.float32), corners.astype(np.float32))
     put = cv2.perspectiveTransform(spots[None], H)[0]
     rays = true_camera(pan_run.truth, at).pixel_to_ray(put)
-    slips = []
-    y, x = np.mgrid[-12:13, -12:13]
+    slips: list[np.ndarray] = []
     for i, (new, old) in enumerate(
         zip(decoded(tmp_path / "over.mp4", "gray"), decoded(pan_run.clip, "gray"), strict=True)
     ):
-        for wanted in true_camera(pan_run.truth, i).ray_to_pixel(rays):
-            if not ((wanted > 20) & (wanted < [SIZE[0] - 20, SIZE[1] - 20])).all():
-                continue
-            cx, cy = np.round(wanted).astype(int)
-            box = (slice(cy - 12, cy + 13), slice(cx - 12, cx + 13))
-            # The share of white, whatever is behind it: the plain difference would lean to one side.
-            weight = (new[box].astype(float) - old[box]) / (255.0 - old[box])
-            weight[weight < 0.15] = 0  # what the encoder did elsewhere
-            found = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum() + [cx, cy]
-            slips.append(found - wanted)
+        slips += disc_slips(new, old, true_camera(pan_run.truth, i).ray_to_pixel(rays))
     assert len(slips) > 3 * n
     rms = float(np.sqrt(np.mean(np.sum(np.square(slips), axis=1))))
     print("mean", np.mean(slips, axis=0))
