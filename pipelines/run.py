@@ -264,11 +264,11 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
         for stage, seconds in solved.timings.seconds.items():
             job.timings.seconds[stage] = job.timings.seconds.get(stage, 0.0) + seconds
         job.folder.save_shot(record, rows)
-        if job.shelf is not None:
+        if job.shelf is not None and not solved.refused:
             own = [facts[o.frame] for o in tracker.observations]
             job.shelf.put(index, tracker, solved, own, images, mask, job.n_levels)
     job.thumbnails |= thumbnails(tracker)
-    if job.shelf is None:
+    if job.shelf is None or index not in job.shelf.indices:
         images.close()
     job.images.pop(id(tracker), None)
     job.records.append(record)

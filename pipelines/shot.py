@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +39,10 @@ from pipelines.keyframe_graph import (
 from pipelines.links import contradicted_frames, without_doubtful
 from pipelines.moving import MovingFinder
 from pipelines.pupil import with_pupil
-from pipelines.pupil_facts import pupil_facts
-from pipelines.readout import readout_facts, with_readout, without_readout
+from pipelines.readout import with_readout, without_readout
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
+from pipelines.rotation_fit import LEAST_PIECE, RotationFit, largest_piece, refuse, rotation_fit
 from pipelines.second_pass import second_pass
 from pipelines.table import FrameFacts, blank_rows, concatenate, shot_rows
 from pipelines.tracking import Observation, ShotTracker
@@ -96,6 +95,12 @@ class CalibratedShot:
     fits: tuple[PairFit, ...] = ()  # that the poses were solved from, with
     steps: tuple[PairFit, ...] = ()  # frame-to-frame pairs that are not among them
     store: FrameStore | None = None  # the panorama's frames, open, where they were asked for
+    explained: RotationFit | None = None  # by a camera that turns and zooms; None: of shots merged into one
+
+    @property
+    def refused(self) -> bool:
+        """Whether no camera is claimed for any frame, because none explains the pictures."""
+        return self.explained is not None and self.explained.refused
 
 
 def solve_shot(
@@ -147,10 +152,28 @@ def solve_shot(
             result.solution, result.graph, GateOptions(refine=result.options), pupil_shift_log_f=shift
         )
         head = believed_level(level(result.solution), verdict)
+    shot_facts = [facts[o.frame] for o in tracker.observations]
+
+    def refused(track: Solution, explained: RotationFit, fits: Sequence[PairFit]) -> CalibratedShot:
+        turned_down = refuse(verdict)
+        return CalibratedShot(
+            solution=track, verdict=turned_down, level=_unknown_level(head), keyframes=result,
+            graph=_graph(tracker, fits), rows=blank_rows(shot_facts, shot, "lost", turned_down.reason),
+            panorama=None, no_panorama="no camera that turns and zooms explains the pictures", timings=timings,
+            fits=tuple(fits), explained=explained,
+        )  # fmt: skip
+
+    steps = frame_steps(tracker)
     with timings.measure("poses"):
         approximate = frame_poses(tracker, result, tracker.fits)
-    shot_facts = [facts[o.frame] for o in tracker.observations]
-    usable = config.panorama.enabled and np.isfinite(approximate.log_f).sum() >= 1
+        explained = rotation_fit(result, approximate, steps)
+    if explained.refused:
+        return refused(approximate, explained, tracker.fits)
+    # Where frames lie relative to each other: the axes of the reference will do.
+    placed = placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px, result.parallax)
+    placeable = largest_piece(placed)
+    torn = len(placeable) < LEAST_PIECE * np.isfinite(approximate.log_f).sum()
+    usable = config.panorama.enabled and placeable and not torn
     if not usable:
         keyed = [f for f in tracker.fits if f.src in tracker.keyframes]
         approximate, doubtful = without_doubtful(approximate, [*result.fits, *keyed])
@@ -158,24 +181,24 @@ def solve_shot(
             shot=shot, facts=shot_facts, solution=approximate, verdict=verdict, level=head, fits=tracker.fits,
             doubtful=doubtful,
         )  # fmt: skip
-        why = "switched off" if not config.panorama.enabled else "no frame has a camera"
+        why = "the pictures do not hang together" if placeable else "no frame has a camera"
+        if not config.panorama.enabled:
+            why = "switched off"
         return CalibratedShot(
             solution=approximate, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, tracker.fits),
             rows=rows, panorama=None, no_panorama=why, timings=timings, fits=tuple(tracker.fits),
+            explained=explained,
         )  # fmt: skip
 
     world = head.R_head_world if head.observable else np.eye(3)
     options = CompositeOptions(views=config.panorama.views)
     with timings.measure("plan"):
-        surface, plan = _plan(approximate, tracker, world, config, options, result.parallax)
+        placements = placements_of(approximate, world, tracker.observations, tracker.size_px, result.parallax)
+        surface, plan = _plan([p for p in placements if p.frame in placeable], config, options)
     store = FrameStore(scratch, tracker.size_px)
     kept = False
     try:
         with timings.measure("second pass"):
-            # Only where frames lie relative to each other counts here: the axes of the reference will do.
-            placed = placements_of(
-                approximate, np.eye(3), tracker.observations, tracker.size_px, result.parallax
-            )
             planned = set(plan.frames)
             found = result.readout
             fits = second_pass(
@@ -190,11 +213,16 @@ def solve_shot(
                 threads=config.run.threads or 2, progress=progress,
             )  # fmt: skip
         with timings.measure("poses"):
-            solution = frame_poses(tracker, result, [*fits, *frame_steps(tracker)])
+            solution = frame_poses(tracker, result, [*fits, *steps])
+            explained = rotation_fit(result, solution, steps)
+            if explained.refused:
+                return refused(solution, explained, fits)
             solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
         with timings.measure("composite"):
             fitting = replace(solution, log_f=np.where(contradicted_frames(solution), np.nan, solution.log_f))
             placements = placements_of(fitting, world, tracker.observations, tracker.size_px, result.parallax)
+            together = largest_piece(placements)
+            placements = [p for p in placements if p.frame in together]
             panorama = None
             if any(p.frame in store for p in placements):
                 panorama = composite(
@@ -219,7 +247,8 @@ def solve_shot(
     return CalibratedShot(
         solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
         rows=rows, panorama=panorama, no_panorama="" if panorama is not None else "no frame fits its camera",
-        timings=timings, fits=tuple(fits), steps=tuple(frame_steps(tracker)), store=store if kept else None,
+        timings=timings, fits=tuple(fits), steps=tuple(steps), store=store if kept else None,
+        explained=explained,
     )  # fmt: skip
 
 
@@ -227,6 +256,10 @@ def believed_level(head: Level, verdict: Verdict) -> Level:
     """The pan axis, if the focal is known: an axis found with a focal that is not known is as wrong as that focal."""
     if verdict.sigma_log_f_total < LEVEL_SIGMA:
         return head
+    return _unknown_level(head)
+
+
+def _unknown_level(head: Level) -> Level:
     return replace(head, observable=False, reason="focal_unknown", sentence=LEVEL_NEEDS_FOCAL)
 
 
@@ -392,14 +425,8 @@ def frame_steps(tracker: ShotTracker) -> list[PairFit]:
 
 
 def _plan(
-    solution: Solution,
-    tracker: ShotTracker,
-    world: NDArray[np.float64],
-    config: Config,
-    options: CompositeOptions,
-    parallax: Parallax | None,
+    placements: Sequence[CameraPlacement], config: Config, options: CompositeOptions
 ) -> tuple[Surface, ViewPlan]:
-    placements = placements_of(solution, world, tracker.observations, tracker.size_px, parallax)
     stride = max(1, len(placements) // MAX_PLACEMENTS_FOR_SURFACE)
     surface = choose_surface(
         placements[::stride], config.panorama.projection, max_pixels=config.panorama.max_megapixels * 1e6
@@ -432,51 +459,3 @@ __all__ = [
     "refine_options_of",
     "solve_shot",
 ]
-
-
-def calibration_facts(shot: CalibratedShot, tracker: ShotTracker) -> dict[str, Any]:
-    """What run.json says about a shot's calibration. JSON-ready but for numpy scalars and NaN."""
-    solution, verdict, head = shot.keyframes.solution, shot.verdict, shot.level
-    reasons: dict[str, int] = {}
-    for fit in tracker.fits:
-        key = str(fit.status) if fit.usable else f"{fit.status}: {fit.reason}"
-        reasons[key] = reasons.get(key, 0) + 1
-    residual = shot.solution.rms_px[np.isfinite(shot.solution.rms_px)]
-    return {
-        "claims_focal": verdict.claims_focal,
-        "reason": verdict.reason,
-        "sentence": verdict.sentence,
-        "sigma_relative": verdict.sigma_log_f_total,
-        "sigma_parts": dict(verdict.sigma_parts),
-        "s10_px": verdict.s10_px,
-        "chi2_dof": verdict.chi2_dof,
-        "rotation_deg": verdict.rotation_deg,
-        "zoom_range": verdict.zoom_range,
-        "support_rows": verdict.support_rows,
-        "flags": list(verdict.flags),
-        "lens": {
-            "pp_px": solution.lens.pp_px.tolist(),
-            "aspect": solution.lens.aspect,
-            "k1_half_c0": solution.lens.c0,
-            "k1_half_c1": solution.lens.c1,
-            "std": dict(solution.lens_std),
-        },
-        "level": {
-            "observable": head.observable,
-            "reason": head.reason,
-            "sentence": head.sentence,
-            "tilt0_deg": float(np.degrees(head.tilt0_rad)),
-            "rho_deg": float(np.degrees(head.rho_rad)),
-            "tilt0_std_deg": float(np.degrees(head.tilt0_std_rad)),
-            "rho_std_deg": float(np.degrees(head.rho_std_rad)),
-        },
-        "pupil": pupil_facts(shot.keyframes.pupil, head.R_head_world if head.observable else np.eye(3)),
-        "rolling_shutter": readout_facts(shot.keyframes.readout),
-        "keyframes": [int(k) for k in sorted(tracker.keyframes)],
-        "keyframe_pairs": len(shot.keyframes.fits),
-        "keyframe_pairs_usable": sum(f.usable for f in shot.keyframes.fits),
-        "rounds": shot.keyframes.rounds,
-        "converged": solution.converged,
-        "first_pass_pairs": reasons,
-        "residual_median_px": float(np.median(residual)) if len(residual) else float("nan"),
-    }

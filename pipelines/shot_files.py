@@ -12,6 +12,7 @@ from calib import rotation
 from mosaic.composite import Panorama
 from pipelines.archive import to_json, write_arrays
 from pipelines.bridge import CameraPlacement
+from pipelines.calibration_facts import calibration_facts
 from pipelines.config import Config
 from pipelines.exports.panorama_deepzoom import write_panorama_deepzoom
 from pipelines.exports.panorama_jpeg import write_panorama_jpeg
@@ -21,7 +22,7 @@ from pipelines.exports.panorama_tiff import write_panorama_tiff
 from pipelines.exports.pto import PtoFrame, write_pto
 from pipelines.output_folder import OutputFolder
 from pipelines.records import ShotRecord
-from pipelines.shot import CalibratedShot, calibration_facts
+from pipelines.shot import CalibratedShot
 from pipelines.table import status_counts
 from pipelines.tracking import ShotTracker
 
@@ -65,7 +66,9 @@ def shot_record(
             "median_std_px": float(np.median(rows.f_std_px[claimed])),
             "median_relative_std": float(np.median(rows.f_std_px[claimed] / rows.f_px[claimed])),
         }
-    if not solved.any():
+    if shot.refused:
+        status, reason, sentence = "failed", shot.verdict.reason, shot.verdict.sentence
+    elif not solved.any():
         status, reason, sentence = (
             "failed",
             "not_linked",

@@ -99,6 +99,10 @@ REASONS = {
         "the pictures contradict a camera that only turns and zooms (it moves, or near things dominate)",
         "a camera on a tripod, far from the scene",
     ),
+    "not_a_rotation": (
+        "no camera that only turns and zooms explains the pictures (a player or crowd fills them, or the camera moves)",
+        "a wider view, in which ground or stands show between those who move",
+    ),
     "pp_at_border": ("the optical centre ran to its limit", "a wider pan with tilt, or the uncropped clip"),
     "pp_at_search_border": (
         "the optical centre ran to its limit",
