@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -46,6 +46,7 @@ from pipelines.rotation_fit import LEAST_PIECE, RotationFit, largest_piece, refu
 from pipelines.second_pass import second_pass
 from pipelines.table import FrameFacts, blank_rows, concatenate, shot_rows
 from pipelines.tracking import Observation, ShotTracker
+from pipelines.verified_part import part_to_solve_alone
 
 log = logging.getLogger(__name__)
 
@@ -127,16 +128,29 @@ def solve_shot(
     with timings.measure("keyframes"):
         templates = {k: key.template for k, key in tracker.keyframes.items()}
         options_k = KeyframeOptions(refine=refine_options, register=tracker.register_options)
-        result = refine_keyframes(
+
+        def refined(chosen: Iterable[int]) -> KeyframeResult:
+            own = {k: templates[k] for k in chosen}
+            return refine_keyframes(
+                own,
+                images,
+                [f for f in tracker.fits if f.src in own and f.dst in own],
+                size_px=tracker.size_px,
+                n_levels=n_levels,
+                mask=mask,
+                priors=priors,
+                options=options_k,
+            )
+
+        result = refined(templates)
+        alone = part_to_solve_alone(
+            [o.frame for o in tracker.observations if o.status == "ok"],
             templates,
-            images,
-            [f for f in tracker.fits if f.src in tracker.keyframes and f.dst in tracker.keyframes],
-            size_px=tracker.size_px,
-            n_levels=n_levels,
-            mask=mask,
-            priors=priors,
-            options=options_k,
+            [*result.fits, *(f for f in tracker.fits if f.src in tracker.keyframes)],
+            result.solution.reference,
         )
+        if alone is not None:
+            result = refined(sorted(alone))
         result = _with_central_reference(result, priors)
 
         def register(solved: Solution, rolling: Rolling | None = None) -> list[PairFit]:
