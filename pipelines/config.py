@@ -46,7 +46,7 @@ class DecodeOptions(Section):
         default="field",
         description=(
             "interlaced sources: one picture a field (the camera moves between fields), one a frame, "
-            "or leave combed"
+            "or leave combed; film in 60i is put together again with either of the first two"
         ),
     )
     pixel_aspect: float | None = Field(

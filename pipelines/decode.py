@@ -27,13 +27,14 @@ from pipelines.config import DecodeOptions
 from pipelines.errors import InputError
 from pipelines.hdr import TRANSFERS, WIDE_PRIMARIES, needs_mapping
 from pipelines.picture import Picture
-from pipelines.pixels import gray_plane, quarter_turns, rgb_picture, yuv_matrix
+from pipelines.pixels import deep_rgb_picture, gray_plane, quarter_turns, rgb_picture, yuv_matrix
 from pipelines.scan import LOOK, STEP, judge_scan
 from pipelines.sources import Source, open_source
 from pipelines.stdin import shown_path
 from pipelines.stills import IMAGE_SUFFIXES, list_images
 from pipelines.timing import PtsRepair, Timecode
 
+TELECINE = "telecine_"  # of scan.judge_scan: film in 60i
 UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
 
 
@@ -46,6 +47,7 @@ class Frame:
     gray: (h, w) uint8 as decoded, or float32 0..255 from sources of more than 8 bits; owned, read-only.
     mask: (h, w) bool, True = usable; None = all of it. pixel_aspect: width over height of a pixel.
     picture: () -> (h, w, 3) uint8 RGB of this frame; it keeps the decoder's picture alive (3 MB at 1080p) while held.
+    deep_picture: (mapped) -> the same as uint16 of 0..65535, with all bits; HDR mapped to BT.709 or as it is.
     """
 
     index: int
@@ -57,6 +59,7 @@ class Frame:
     mask: NDArray[np.bool_] | None
     pixel_aspect: float
     picture: Callable[[], NDArray[np.uint8]]
+    deep_picture: Callable[[bool], NDArray[np.uint16]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,9 +69,10 @@ class ClipFacts:
     size_px: (w, h) of the pictures handed out, after rotation. fps: decoded frames/s by the header, NaN unknown;
     picture_fps: pictures handed out per s (twice fps where fields are). n_frames_header: as the header claims, or None.
     colour: space, range, primaries, transfer as FFmpeg's numbers and the matrix used for RGB. rotation_deg: applied,
-    counter-clockwise. scan_seen: 'tff', 'bff', 'progressive', 'unknown' by the first pictures' content; scan_flagged:
-    'interlaced' or 'progressive' by its first picture's flag; field_order: that of the content if interlaced, '' = as
-    flagged. deinterlace: 'none', 'bwdif send_field' or 'bwdif send_frame'. timecode: of picture 0, or ''.
+    counter-clockwise. scan_seen: 'tff', 'bff', 'progressive', 'telecine_tff', 'telecine_bff', 'unknown' by the first
+    pictures' content; scan_flagged: 'interlaced' or 'progressive' by its first picture's flag; field_order: that of the
+    content if interlaced, '' = as flagged. deinterlace: 'none', 'bwdif send_field', 'bwdif send_frame' or 'fieldmatch'
+    (pull-down undone). timecode: of picture 0, or ''.
     """
 
     path: Path
@@ -209,14 +213,21 @@ def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) ->
     width, height = (video.width, video.height) if turns % 2 == 0 else (video.height, video.width)
     # The picture's own flag decides: stream headers call plenty of progressive material interlaced.
     flagged = bool(video.interlaced_frame)
-    field_order = _judge_order(flagged, source.field_order, seen, warnings)
+    pulled = seen.startswith(TELECINE)
+    order = seen.removeprefix(TELECINE)
+    field_order = order if pulled else _judge_order(flagged, source.field_order, seen, warnings)
     interlaced = flagged or bool(field_order)
     if source.says_interlaced and not interlaced:
         warnings.append(
             "the stream calls itself interlaced, its first picture is not: each is judged by itself"
         )
     mode = "none" if not interlaced or options.deinterlace == "off" else f"bwdif send_{options.deinterlace}"
-    if interlaced:
+    if pulled and mode != "none":
+        mode = "fieldmatch"
+        warnings.append(
+            f"film in interlaced frames (3:2 pull-down, {order}): its pictures are put together again"
+        )
+    elif interlaced:
         how = {"off": "left combed", "field": "one picture a field", "frame": "one picture a frame"}
         warnings.append(f"interlaced: {how[options.deinterlace]} (deinterlacing: {mode})")
     aspect = options.pixel_aspect or source.pixel_aspect or 1.0
@@ -239,7 +250,8 @@ def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) ->
         path=source.path,
         size_px=(width, height),
         fps=source.fps,
-        picture_fps=source.fps * (2 if mode.endswith("send_field") else 1),
+        picture_fps=source.fps
+        * (2.0 if mode.endswith("send_field") else 0.8 if mode == "fieldmatch" else 1.0),
         n_frames_header=source.n_frames_header,
         duration_s=source.duration_s,
         container=source.container_name,
@@ -266,6 +278,13 @@ def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) ->
         mtime_ns=stat.st_mtime_ns if stat is not None else 0,
         warnings=warnings,
     )
+
+
+def _counted(pictures: Iterator[Picture], read: list[int]) -> Iterator[Picture]:
+    """The same pictures; read[0] is how many have been asked for."""
+    for picture in pictures:
+        read[0] += 1
+        yield picture
 
 
 def _judge_order(flagged: bool, stated: str, seen: str, warnings: list[str]) -> str:
@@ -398,8 +417,10 @@ def _frames(
     with open_source(facts.path, options) as source:
         repair = PtsRepair(facts.fps)
         everything = facts.interlaced and facts.scan_flagged == "progressive"  # by the content alone
+        mode = "telecine" if facts.deinterlace == "fieldmatch" else options.deinterlace
+        read = [0]
         pictures = source.fields(
-            repair.apply(source.pictures()), options.deinterlace, facts.field_order, everything
+            _counted(repair.apply(source.pictures()), read), mode, facts.field_order, everything
         )
         for index, picture in enumerate(pictures):
             if last is not None and index > last:
@@ -421,7 +442,10 @@ def _frames(
                 mask=None,
                 pixel_aspect=facts.pixel_aspect,
                 picture=partial(rgb_picture, picture.video, turns),
+                deep_picture=partial(deep_rgb_picture, picture.video, turns),
             )
+        if complete:
+            counts["decoded"] = read[0]  # the last of them may be one that repeats, and is not handed out
         counts["failed_packets"] = source.n_failed
         counts["repaired_pts"] = repair.n_repaired
         counts["gaps"] = repair.n_gaps

@@ -2,6 +2,7 @@
 
 A line of one field is compared with the two lines of the other field around it (FFmpeg's idet does so): fields that are
 neighbours in time fit better than fields three apart. A scene at rest tells nothing, and then nothing is claimed.
+Film in 60i (3:2 pull-down) shows as one or two interlaced frames in every five, always at the same places.
 """
 
 from __future__ import annotations
@@ -23,25 +24,45 @@ COMB_RATIO = (
 )
 MIN_MISFIT = 1.0  # grey levels between neighbour pictures, below it the scene rests
 MIN_VOTES = 4
+CYCLE = 5  # frames of a pull-down cycle
+PULLDOWNS = ((0, 1), (0,))  # interlaced frames of a cycle, from the first: 2:3, and 2:3:3:2 ("advanced")
 
 
 def judge_scan(lumas: Iterable[NDArray[np.float32]]) -> str:
-    """'tff', 'bff' or 'progressive' if at least four pictures say so and hardly any other; else 'unknown'.
+    """'tff', 'bff' or 'progressive' if at least four pictures say so and hardly any other; 'telecine_tff' or
+    'telecine_bff' if interlaced and progressive ones alternate as pull-down has them; else 'unknown'.
 
     lumas: (h, w // STEP) grey 0..255 of consecutive frames, at most LOOK of them are used.
     """
-    votes: Counter[str] = Counter()
+    told: list[str] = []
     before: NDArray[np.float32] | None = None
     here: NDArray[np.float32] | None = None
     for following in islice(lumas, LOOK):
         if before is not None and here is not None:
-            votes[_vote(before, here, following)] += 1
+            told.append(_vote(before, here, following))
         before, here = here, following
+    if pulled := _pulldown(told):
+        return pulled
+    votes = Counter(told)
     del votes["unknown"]
     if not votes:
         return "unknown"
     winner, n = votes.most_common(1)[0]
     return winner if n >= MIN_VOTES and n >= 0.8 * votes.total() else "unknown"
+
+
+def _pulldown(told: list[str]) -> str:
+    """'telecine_tff' or 'telecine_bff' where the votes of consecutive frames repeat every five as pull-down does."""
+    for order in ("tff", "bff"):
+        for places in PULLDOWNS:
+            for phase in range(CYCLE):
+                combed = [vote for i, vote in enumerate(told) if (i - phase) % CYCLE in places]
+                whole = [vote for i, vote in enumerate(told) if (i - phase) % CYCLE not in places]
+                yes = combed.count(order), whole.count("progressive")
+                known = sum(vote != "unknown" for vote in told)
+                if yes[0] >= MIN_VOTES - 1 and yes[1] >= MIN_VOTES and sum(yes) >= 0.9 * known:
+                    return f"telecine_{order}"
+    return ""
 
 
 def _vote(before: NDArray[np.float32], here: NDArray[np.float32], following: NDArray[np.float32]) -> str:

@@ -19,6 +19,7 @@ from pipelines.deinterlace import deinterlace
 from pipelines.errors import InputError
 from pipelines.picture import Picture
 from pipelines.stills import IMAGE_SUFFIXES, is_pattern, list_images
+from pipelines.telecine import undo_telecine
 from pipelines.timing import Timecode
 
 # Formats that are lists of other files or addresses: a hostile "clip" could read what the user did not name.
@@ -160,6 +161,8 @@ class ContainerSource:
     def fields(
         self, pictures: Iterable[Picture], mode: str, order: str, everything: bool
     ) -> Iterator[Picture]:
+        if mode == "telecine":
+            return undo_telecine(pictures, order)
         return deinterlace(pictures, mode, order, everything)
 
     def late_warnings(self, n_decoded: int) -> list[str]:

@@ -30,13 +30,17 @@ BLACK, WHITE = 16, 235  # of limited range, 8 bits
 BT709, BT601, BT2020 = (1, 1, 1), (6, 6, 6), (9, 9, 14)
 PQ, HLG = (9, 9, 16), (9, 9, 18)
 LIMITED, FULL = 1, 2
+NTSC = Fraction(30000, 1001)
+# Pictures of film whose fields make five frames out of four: of the field that comes first, and of the second.
+FIRST_FIELD, SECOND_FIELD = (0, 0, 1, 2, 3), (0, 1, 2, 2, 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
     """A file: encoder, pixel format, container, tags. noise: mean grey levels that its coding may change.
 
-    scan: what the pictures are: progressive, tff, bff; flags: what the file says. colour: matrix, primaries, transfer.
+    scan: what the pictures are: progressive, tff, bff, telecine_tff, telecine_bff (film in 60i), soft (film that asks
+    to be shown so, by MPEG-2's repeat flags); flags: what the file says. colour: matrix, primaries, transfer.
     """
 
     name: str
@@ -51,6 +55,11 @@ class Case:
     noise: float = 2.0
     scan: str = "progressive"
     flags: str = "progressive"
+
+    @property
+    def n_coded(self) -> int:
+        """Frames in the file: N, or with pull-down five for every four."""
+        return N * 5 // 4 if self.scan.startswith("telecine") else N
 
     @property
     def bits(self) -> int:
@@ -137,6 +146,18 @@ CASES = (
          scan="tff", flags="progressive"),
     Case(name="progressive, flagged interlaced", codec="libx264", pix_fmt="yuv420p", suffix="mp4", options=X264,
          flags="tff"),
+    *(Case(name=f"film in 60i, {word} ({codec})", codec=codec, pix_fmt=pix_fmt, suffix=suffix, options=options,
+           fps=NTSC, scan=f"telecine_{flags}", flags=flags)
+      for codec, pix_fmt, suffix, options in (
+          ("libx264", "yuv420p", "ts", X264),
+          ("mpeg2video", "yuv422p", "mxf", {"b": "8M", "flags": "+ildct+ilme"}),
+          ("prores_ks", "yuv422p10le", "mov", {"flags": "+ildct"}),
+      )
+      for word, flags in (("top field first", "tff"), ("bottom field first", "bff"))),
+    Case(name="film in 60i, flagged progressive", codec="libx264", pix_fmt="yuv420p", suffix="mp4", options=X264,
+         fps=NTSC, scan="telecine_tff"),
+    Case(name="film with repeat flags", codec="mpeg2video", pix_fmt="yuv420p", suffix="m2v",
+         options={"b": "8M", "bf": "0", "flags": "+ildct"}, fps=NTSC, scan="soft"),
 )  # fmt: skip
 
 
@@ -162,11 +183,38 @@ def luma(index: float, size: tuple[int, int] = SIZE) -> NDArray[np.float64]:
 
 
 def woven(index: int, scan: str, size: tuple[int, int] = SIZE) -> NDArray[np.float64]:
-    """One interlaced frame: its two fields are half a picture apart."""
-    picture = luma(index, size).copy()
-    later = 1 if scan == "tff" else 0  # rows of the field that comes second
-    picture[later::2] = luma(index + 0.5, size)[later::2]
+    """One interlaced frame: its two fields are half a picture apart, or of the film's pictures that pull-down gives."""
+    first, second = float(index), index + 0.5
+    if scan.startswith("telecine"):
+        cycle, place = divmod(index, 5)
+        first, second = 4.0 * cycle + FIRST_FIELD[place], 4.0 * cycle + SECOND_FIELD[place]
+    picture = luma(first, size).copy()
+    later = 1 if scan.endswith("tff") else 0  # rows of the field that comes second
+    picture[later::2] = luma(second, size)[later::2]
     return picture
+
+
+def ask_for_repeats(path: Path) -> None:
+    """Set MPEG-2's flags so that progressive pictures are shown for three and two fields in turn: 24 a second in 60i.
+
+    ISO 13818-2: the picture coding extension (start code B5, kind 8) has top_field_first, repeat_first_field and
+    progressive_frame in its fourth and fifth byte; a sequence extension (kind 1) that is progressive forbids it."""
+    data = bytearray(path.read_bytes())
+    n = 0
+    for at in range(len(data) - 9):
+        if data[at : at + 4] != b"\x00\x00\x01\xb5":
+            continue
+        kind = data[at + 4] >> 4
+        if kind == 1:
+            data[at + 5] &= ~0x08 & 0xFF  # progressive_sequence
+        elif kind == 8:
+            top_first = n % 4 in (0, 1)  # T B T, B T, B T B, T B: three fields turn the order round
+            data[at + 7] = (
+                (data[at + 7] & ~0x82 & 0xFF) | (0x80 if top_first else 0) | (0x02 if n % 2 == 0 else 0)
+            )
+            data[at + 8] |= 0x80  # progressive_frame
+            n += 1
+    path.write_bytes(bytes(data))
 
 
 def video_frame(grey: NDArray[np.float64], pix_fmt: str) -> av.VideoFrame:
@@ -207,10 +255,9 @@ def make(case: Case, folder: Path) -> Path:
         if case.flags != "progressive" and case.codec == "libx264":
             context.options = {**case.options, "x264-params": f"{case.flags}=1:log-level=none"}
         mark = _field_marker(case) if case.flags != "progressive" else None
-        for index in range(N):
-            grey = (
-                luma(index, case.size) if case.scan == "progressive" else woven(index, case.scan, case.size)
-            )
+        for index in range(case.n_coded):
+            whole = case.scan in ("progressive", "soft")
+            grey = luma(index, case.size) if whole else woven(index, case.scan, case.size)
             if case.color_range == FULL:
                 grey = (grey - BLACK) * 255 / (WHITE - BLACK)
             frame = video_frame(grey, case.pix_fmt)
@@ -224,6 +271,8 @@ def make(case: Case, folder: Path) -> Path:
                 frame.color_range = case.color_range
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
+    if case.scan == "soft":
+        ask_for_repeats(path)
     return path
 
 
@@ -242,8 +291,10 @@ def _field_marker(case: Case) -> av.filter.Graph:
 
 def expected(case: Case, index: int) -> NDArray[np.float64]:
     """What picture `index` of the decoded case shall be: fields are half a picture apart, full range spans 0..255."""
-    if case.scan != "progressive":
+    if case.scan in ("tff", "bff"):
         grey = luma(index / 2, case.size)
+    elif case.scan != "progressive":
+        grey = luma(index, case.size)
     else:  # taken apart into fields, both show the same moment
         grey = luma(index // 2 if case.flags != "progressive" else index, case.size)
     return (grey - BLACK) * 255 / (WHITE - BLACK) if case.color_range == FULL else grey
