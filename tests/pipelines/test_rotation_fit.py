@@ -27,13 +27,10 @@ N = 30
 
 
 def fit_of(**values: Any) -> RotationFit:
-    given = {
-        "residual_px": 0.3,
-        "residual_limit_px": 2.0,
-        "chi2_dof": 1.0,
-        "steps": 50,
+    given: dict[str, Any] = {
+        "residual_px": 0.3, "chi2_dof": 1.0, "width_px": 1280, "step_error_px": 0.5, "steps": 50,
         "steps_contradicted": 0,
-    }
+    }  # fmt: skip
     return RotationFit(**(given | values))
 
 
@@ -74,6 +71,11 @@ def test_only_a_large_misfit_refuses() -> None:
         chi2_dof=20.0
     ).refused  # exact measurements of a lens with more terms: no reason to lose the shot
     assert fit_of(residual_px=3.0, chi2_dof=8.0).refused
+    assert not fit_of(residual_px=3.0, chi2_dof=4.5).refused
+    assert fit_of(
+        residual_px=3.0, chi2_dof=4.5, step_error_px=2.0
+    ).refused  # and the cameras do not repeat the steps
+    assert not fit_of(residual_px=np.nan, chi2_dof=np.nan, step_error_px=np.nan, steps=0).refused
 
 
 def test_cameras_that_contradict_the_steps_refuse() -> None:
