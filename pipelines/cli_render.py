@@ -40,6 +40,14 @@ class Fill(StrEnum):
     panorama = "panorama"
 
 
+class CodecName(StrEnum):
+    """How the video is encoded."""
+
+    h264 = "h264"
+    hevc10 = "hevc10"
+    prores = "prores"
+
+
 class Space(StrEnum):
     """What the corners of an overlay are given in."""
 
@@ -66,7 +74,9 @@ def render(
     what: Annotated[What, typer.Option("--what", help="What to render.")],
     path: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Video to write (.mp4, .mov, .mkv); default: OUT/WHAT.mp4."),
+        typer.Option(
+            "-o", "--out", help="Video to write (.mp4, .mov, .mkv); default: OUT/WHAT.mp4 (prores: .mov)."
+        ),
     ] = None,
     shot: Annotated[int | None, typer.Option(min=0, help="This shot only; default: the whole clip.")] = None,
     clip: Annotated[
@@ -94,6 +104,15 @@ def render(
         Path | None, typer.Option(help="overlay: clicked points of the pitch, for --in pitch.")
     ] = None,
     template: Annotated[str, typer.Option(help="overlay: the field whose points the clicks name.")] = "",
+    camera: Annotated[
+        str,
+        typer.Option(
+            "--camera", help="overlay: X,Y,Z in m of the camera, if known: two clicks are enough then."
+        ),
+    ] = "",
+    click_px: Annotated[
+        float, typer.Option("--click-px", min=0.05, max=50, help="overlay: one-sigma error of a click, px.")
+    ] = 1.0,
     opacity: Annotated[float, typer.Option(min=0, max=1, help="overlay: 0 to 1.")] = 1.0,
     in_front: Annotated[
         bool, typer.Option("--in-front", help="overlay: before the players too; needs no panorama.")
@@ -104,8 +123,12 @@ def render(
         float | None, typer.Option(min=1, max=240, help="move: pictures per second; default: the clip's.")
     ] = None,
     sound: Annotated[bool, typer.Option("--sound/--no-sound", help="Copy the clip's sound.")] = True,
+    codec: Annotated[
+        CodecName,
+        typer.Option(help="h264 (8 bits), hevc10 (10 bits) or prores (422 HQ, 10 bits, .mov or .mkv)."),
+    ] = CodecName.h264,
     crf: Annotated[
-        float, typer.Option(min=0, max=51, help="x264's quality; lower is better and larger.")
+        float, typer.Option(min=0, max=51, help="Quality of H.264 and HEVC; lower is better and larger.")
     ] = 18.0,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -118,8 +141,8 @@ def render(
     from pipelines.render.opened import open_run
 
     run = open_run(out)
-    target = path or out / f"{what.value}.mp4"
-    encode = EncodeOptions(crf=crf)
+    target = path or out / f"{what.value}{'.mov' if codec is CodecName.prores else '.mp4'}"
+    encode = EncodeOptions(codec=codec.value, crf=crf)
     with TerminalProgress(show=not quiet) as progress:
         if what is What.stabilised:
             from pipelines.render.stabilise import StabiliseOptions, stabilise
@@ -136,7 +159,7 @@ def render(
             if space is Space.pitch:
                 from pipelines.cli_pitch import fitted
 
-                pitch = fitted(out, clicks, template, "", 1.0)
+                pitch = fitted(out, clicks, template, camera, click_px)
             placing = OverlayOptions(
                 picture=image, corners=_pairs(corners), space=space.value, at=at, opacity=opacity,
                 in_front=in_front, shot=shot, sound=sound, clip=clip, pitch=pitch,

@@ -38,8 +38,11 @@ def needs_mapping(video: av.VideoFrame) -> bool:
     return _tag(video, "color_trc") in TRANSFERS or _tag(video, "color_primaries") in WIDE_PRIMARIES
 
 
-def to_bt709(video: av.VideoFrame, matrix: Colorspace) -> NDArray[np.uint8]:
-    """(h, w, 3) uint8 RGB, BT.709 primaries and transfer. matrix: of its YCbCr (unused for an RGB picture)."""
+def to_bt709(video: av.VideoFrame, matrix: Colorspace, *, deep: bool = False) -> NDArray[Any]:
+    """(h, w, 3) RGB, BT.709 primaries and transfer; uint8, or uint16 of 0..65535 where `deep`.
+
+    matrix: of its YCbCr (unused for an RGB picture).
+    """
     transfer = _tag(video, "color_trc")
     primaries = _tag(video, "color_primaries")
     # HDR without primaries is BT.2020 by its standard (BT.2100); wide primaries without a transfer are SDR.
@@ -48,21 +51,23 @@ def to_bt709(video: av.VideoFrame, matrix: Colorspace) -> NDArray[np.uint8]:
         primaries if primaries in WIDE_PRIMARIES else (9 if transfer in TRANSFERS else BT709),
     )
     full = int(video.color_range) == 2 or video.format.is_rgb or video.format.name.startswith("yuvj")
-    key = (video.width, video.height, video.format.name, matrix, full, tags)
+    key = (video.width, video.height, video.format.name, matrix, full, tags, deep)
     with _LOCK:
-        graph = _GRAPHS.pop(key, None) or _graph(video, matrix, full, *tags)
+        graph = _GRAPHS.pop(key, None) or _graph(video, matrix, full, *tags, deep)
         _GRAPHS[key] = graph
         if len(_GRAPHS) > KEPT_GRAPHS:
             _GRAPHS.pop(next(iter(_GRAPHS)))
         graph.push(video)
-        return np.asarray(graph.pull().to_ndarray(), np.uint8)
+        return np.asarray(graph.pull().to_ndarray(), np.uint16 if deep else np.uint8)
 
 
 def _tag(video: av.VideoFrame, name: str) -> int:
     return int(getattr(video, name, UNSPECIFIED))
 
 
-def _graph(video: av.VideoFrame, matrix: Colorspace, full: bool, transfer: int, primaries: int) -> Graph:
+def _graph(
+    video: av.VideoFrame, matrix: Colorspace, full: bool, transfer: int, primaries: int, deep: bool
+) -> Graph:
     graph = Graph()
     name = video.format.name
     source = graph.add(
@@ -82,7 +87,7 @@ def _graph(video: av.VideoFrame, matrix: Colorspace, full: bool, transfer: int, 
             # Of the tags only numbers are left: or the scaler would map the table's output a second time.
             graph.add("setparams", "color_primaries=bt709:color_trc=bt709"),
             graph.add("lut3d", args=f"file='{table}':interp=tetrahedral"),
-            graph.add("format", "pix_fmts=rgb24"),
+            graph.add("format", "pix_fmts=rgb48le" if deep else "pix_fmts=rgb24"),
             graph.add("buffersink"),
         ]
         for a, b in pairwise([source, *steps]):

@@ -1,7 +1,7 @@
-"""Pictures out: H.264 in yuv420p with the clip's own times and colour tags, its sound copied beside them.
+"""Pictures out: H.264, or HEVC and ProRes of 10 bits, with the clip's own times and colour tags, its sound beside them.
 
 A file has its name only when it is whole. Colours are the decoder's RGB turned back by the same matrix; output is
-always of limited range and 8 bits.
+always of limited range.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import av
 import cv2
@@ -21,18 +21,20 @@ from numpy.typing import NDArray
 
 from pipelines.errors import OutputError
 from pipelines.exports.whole_file import whole_file
+from pipelines.hdr import TRANSFERS, WIDE_PRIMARIES
+from pipelines.pixels import LUMA_WEIGHTS
 
+Codec = Literal["h264", "hevc10", "prores"]
 SUFFIXES = (".mp4", ".mov", ".mkv")
 # FFmpeg's AVColorSpace numbers of the matrices that decoding may have used.
 MATRIX_TAG = {"ITU709": 1, "FCC": 4, "ITU601": 6, "SMPTE240M": 7, "BT2020": 9}
-# Shares of red and of blue in luma: ITU-R BT.709, BT.601, BT.2020; SMPTE 240M; FCC 73.682.
-LUMA_WEIGHTS = {
-    "ITU709": (0.2126, 0.0722),
-    "ITU601": (0.299, 0.114),
-    "BT2020": (0.2627, 0.0593),
-    "SMPTE240M": (0.212, 0.087),
-    "FCC": (0.30, 0.11),
+# What codec gives which pixels, through which of FFmpeg's encoders, in which containers.
+CODECS = {
+    "h264": ("libx264", "yuv420p", 8, (".mp4", ".mov", ".mkv")),
+    "hevc10": ("libx265", "yuv420p10le", 10, (".mp4", ".mov", ".mkv")),
+    "prores": ("prores_ks", "yuv422p10le", 10, (".mov", ".mkv")),
 }
+DEEP = 257  # from 0..255 to 0..65535
 AT_LEFT, BETWEEN = np.array([0.25, 0.5, 0.25]), np.array([0.0, 0.5, 0.5])
 UNSPECIFIED, LIMITED_RANGE = 2, 1
 REGULAR = 0.1  # of a frame: an even rate in a container of milliseconds is off by .03 at 60 pictures/s
@@ -41,10 +43,20 @@ FINE_TICKS = 90_000  # per second, for clips of variable rate
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncodeOptions:
-    """crf: x264's quality, 18 is hard to tell from the source. preset: x264's; 'fast' is about real time at 720p."""
+    """codec: 'h264' (8 bits, 4:2:0), 'hevc10' (10 bits, 4:2:0) or 'prores' (422 HQ, 10 bits; .mov or .mkv).
 
+    crf: quality of the first two, 18 is hard to tell from the source. preset: theirs; 'fast' H.264 is about real time
+    at 720p.
+    """
+
+    codec: Codec = "h264"
     crf: float = 18.0
     preset: str = "fast"
+
+    @property
+    def deep(self) -> bool:
+        """Whether it keeps more than 8 bits, and so wants pictures of uint16."""
+        return CODECS[self.codec][2] > 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,27 +89,31 @@ def nominal_rate(fps: float) -> Fraction:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class VideoWriter:
-    """Takes pictures (h, w, 3) uint8 RGB in order. n_written counts them; sound says in words what became of it."""
+    """Takes pictures (h, w, 3) RGB in order, uint8, or uint16 of 0..65535, of which the codec keeps what it can.
+
+    n_written counts them; sound says in words what became of it.
+    """
 
     clock: Clock
     matrix: Colorspace
     tags: Mapping[str, int]
     size_px: tuple[int, int]
+    pix_fmt: str
     _container: Any
     _stream: Any
     _sound: _Sound | None
     sound: str
     n_written: int = field(default=0)
 
-    def write(self, picture: NDArray[np.uint8]) -> None:
-        """One more picture. Raises ValueError: too many, or of another size."""
+    def write(self, picture: NDArray[Any]) -> None:
+        """One more picture. Raises ValueError: too many, of another size, or of another kind of number."""
         w, h = self.size_px
         if picture.shape != (h, w, 3):
             raise ValueError(f"picture is {picture.shape}, the video ({h}, {w}, 3)")
         tick = self.clock.ticks[self.n_written]
         # 4:2:0 needs even sides: an odd last row or column goes.
         even = np.ascontiguousarray(picture[: h - h % 2, : w - w % 2])
-        frame = av.VideoFrame.from_ndarray(to_yuv420(even, self.matrix), format="yuv420p")
+        frame = video_frame(even, self.matrix, self.pix_fmt)
         for name, value in self.tags.items():
             setattr(frame, name, value)
         frame.pts, frame.time_base = tick, self.clock.time_base
@@ -125,8 +141,11 @@ def video_writer(
     Raises OutputError: another suffix, no such folder, disk full.
     """
     options = options or EncodeOptions()
+    encoder, pix_fmt, _, suffixes = CODECS[options.codec]
     if path.suffix.lower() not in SUFFIXES:
         raise OutputError(path, "the name does not say which container", f"end it in {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in suffixes:
+        raise OutputError(path, f"{options.codec} does not go into it", f"end it in {' or '.join(suffixes)}")
     matrix = (
         Colorspace[str(colour.get("rgb_matrix", "none"))] if colour.get("rgb_matrix") in MATRIX_TAG else None
     )
@@ -140,12 +159,12 @@ def video_writer(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as temporary, av.open(str(temporary), "w") as container:
-            stream: Any = container.add_stream(
-                "libx264", rate=clock.rate, options={"crf": f"{options.crf:g}", "preset": options.preset}
-            )
+            stream: Any = container.add_stream(encoder, rate=clock.rate, options=_encoder_options(options))
             stream.width, stream.height = size_px[0] - size_px[0] % 2, size_px[1] - size_px[1] % 2
-            stream.pix_fmt, stream.time_base = "yuv420p", clock.time_base
+            stream.pix_fmt, stream.time_base = pix_fmt, clock.time_base
             stream.codec_context.time_base = clock.time_base
+            if options.codec == "hevc10" and path.suffix.lower() != ".mkv":
+                stream.codec_context.codec_tag = "hvc1"  # what Apple's players ask for
             for name, value in tags.items():
                 setattr(stream.codec_context, name, value)
             if abs(pixel_aspect - 1) > 1e-6:
@@ -153,8 +172,8 @@ def video_writer(
                 stream.codec_context.sample_aspect_ratio = ratio
             with _sound_source(sound_of, sound_from_s, container) as (sound, words):
                 writer = VideoWriter(
-                    clock=clock, matrix=matrix, tags=tags, size_px=size_px, _container=container, _stream=stream,
-                    _sound=sound, sound=words,
+                    clock=clock, matrix=matrix, tags=tags, size_px=size_px, pix_fmt=pix_fmt, _container=container,
+                    _stream=stream, _sound=sound, sound=words,
                 )  # fmt: skip
                 yield writer
                 container.mux(stream.encode(None))
@@ -167,21 +186,52 @@ def video_writer(
         ) from None
 
 
-def to_yuv420(rgb: NDArray[np.uint8], matrix: Colorspace) -> NDArray[np.uint8]:
-    """RGB (h, w, 3), sides even, to limited-range planes one below the other (3 h / 2, w), chroma sited left (H.264).
+def _encoder_options(options: EncodeOptions) -> dict[str, str]:
+    if options.codec == "prores":
+        return {"profile": "3", "vendor": "apl0"}
+    words = {"crf": f"{options.crf:g}", "preset": options.preset}
+    return words if options.codec == "h264" else {**words, "x265-params": "log-level=error"}
 
-    Not FFmpeg's converter: that cuts instead of rounding, and the picture comes back darker by a grey level or more.
+
+def shown_colour(colour: Mapping[str, Any]) -> dict[str, Any]:
+    """ClipFacts.colour of pictures that were mapped to BT.709 if they were HDR or of a wide gamut (hdr.py)."""
+    if int(colour.get("transfer", 0)) in TRANSFERS or int(colour.get("primaries", 0)) in WIDE_PRIMARIES:
+        return {**colour, "rgb_matrix": "ITU709", "primaries": 1, "transfer": 1}
+    return dict(colour)
+
+
+def video_frame(rgb: NDArray[Any], matrix: Colorspace, pix_fmt: str) -> av.VideoFrame:
+    """RGB (h, w, 3), sides even, uint8 or uint16 of 0..65535, as limited-range YCbCr of a format in CODECS.
+
+    Chroma is sited left (H.264, HEVC, ProRes). Not FFmpeg's converter: that cuts instead of rounding, and the picture
+    comes back darker by a grey level or more. Raises ValueError: another kind of number.
     """
+    if rgb.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"pictures are uint8 or uint16, not {rgb.dtype}")
+    bits = 10 if pix_fmt.endswith("10le") else 8
     red, blue = LUMA_WEIGHTS[matrix.name]
     y = np.array([red, 1 - red - blue, blue])
     cb, cr = (np.array([0, 0, 1.0]) - y) / (2 * (1 - blue)), (np.array([1.0, 0, 0]) - y) / (2 * (1 - red))
-    M = np.column_stack([np.stack([219 * y, 224 * cb, 224 * cr]) / 255, [16.0, 128.0, 128.0]])
-    yuv = cv2.transform(rgb, M)
-    # A chroma sample lies on every second column, half-way between two rows.
-    chroma = cv2.sepFilter2D(yuv[..., 1:], -1, AT_LEFT, BETWEEN, borderType=cv2.BORDER_REPLICATE)[::2, ::2]
-    h, w = rgb.shape[:2]
-    planes = [yuv[..., 0].reshape(-1), chroma[..., 0].reshape(-1), chroma[..., 1].reshape(-1)]
-    return np.concatenate(planes).reshape(h * 3 // 2, w).astype(np.uint8, copy=False)
+    gain, top = 2.0 ** (bits - 8), 255 if rgb.dtype == np.uint8 else 65535
+    M = np.column_stack(
+        [np.stack([219 * y, 224 * cb, 224 * cr]) * gain / top, np.array([16, 128, 128]) * gain]
+    )
+    # 8 bits stay 8 bits (cv2 rounds); deeper ones are mixed as floats and rounded at the end.
+    plain = bits == 8 and rgb.dtype == np.uint8
+    yuv = cv2.transform(rgb if plain else rgb.astype(np.float32), M)
+    half_height = pix_fmt.startswith("yuv420p")
+    down = BETWEEN if half_height else np.array([0.0, 1.0, 0.0])
+    # A chroma sample lies on every second column; in 4:2:0 half-way between two rows.
+    chroma = cv2.sepFilter2D(yuv[..., 1:], -1, AT_LEFT, down, borderType=cv2.BORDER_REPLICATE)
+    chroma = chroma[:: 2 if half_height else 1, ::2]
+    kind: Any = np.uint8 if bits == 8 else np.dtype("<u2")
+    frame = av.VideoFrame(rgb.shape[1], rgb.shape[0], pix_fmt)
+    for plane, values in zip(frame.planes, (yuv[..., 0], chroma[..., 0], chroma[..., 1]), strict=True):
+        codes = values if plain else np.clip(values + 0.5, 0, (1 << bits) - 1)
+        padded = np.zeros((plane.height, plane.line_size // np.dtype(kind).itemsize), kind)
+        padded[:, : plane.width] = codes.astype(kind)
+        plane.update(padded.tobytes())
+    return frame
 
 
 # ---- sound

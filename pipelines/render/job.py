@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipelines.decode import Clip, Frame
 from pipelines.errors import InputError
 from pipelines.progress import Progress
-from pipelines.render.encode import EncodeOptions, VideoWriter, clock_of, video_writer
+from pipelines.render.encode import DEEP, EncodeOptions, VideoWriter, clock_of, shown_colour, video_writer
 from pipelines.render.opened import OpenedRun
 
 
@@ -73,10 +73,19 @@ def chosen_rows(run: OpenedRun, shot: int | None) -> list[int]:
 
 
 def pictures(
-    run: OpenedRun, clip: Clip, rows: Sequence[int], progress: Progress, stage: str
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    run: OpenedRun,
+    clip: Clip,
+    rows: Sequence[int],
+    progress: Progress,
+    stage: str,
+    encode: EncodeOptions | None = None,
+    *,
+    mixed: bool,
+) -> Iterator[tuple[int, NDArray[Any]]]:
     """Row and RGB picture (h, w, 3) of the frames of `rows`, in the clip's order; one is held at a time.
 
+    uint8, or uint16 of 0..65535 for a codec of more bits. mixed: with pictures of BT.709 (panorama, inlay), so that HDR
+    is mapped to it; else a codec of more bits gets the clip's own colours.
     Raises InputError: the clip ends before the frames do, or its pictures have another size.
     """
     wanted = {int(run.table.frame[row]): row for row in rows}
@@ -89,7 +98,8 @@ def pictures(
         row = wanted.get(frame.index)
         if row is None:
             continue
-        picture = frame.picture()
+        deep = encode is not None and encode.deep
+        picture: NDArray[Any] = frame.deep_picture(mixed) if deep else frame.picture()
         if picture.shape != (h, w, 3):
             size = f"{picture.shape[1]}x{picture.shape[0]}"
             raise InputError(
@@ -104,19 +114,42 @@ def pictures(
 
 
 def writer_like(
-    run: OpenedRun, clip: Clip, rows: Sequence[int], path: Path, *, sound: bool, encode: EncodeOptions | None
+    run: OpenedRun,
+    clip: Clip,
+    rows: Sequence[int],
+    path: Path,
+    *,
+    sound: bool,
+    encode: EncodeOptions | None,
+    mixed: bool,
 ) -> AbstractContextManager[VideoWriter]:
-    """video_writer() for pictures of these rows as the clip has them: size, times, colour tags, its sound if wanted."""
+    """video_writer() for pictures of these rows as the clip has them: size, times, colour tags, its sound if wanted.
+
+    mixed: as for `pictures`; the tags say what its colours are.
+    """
+    own = encode is not None and encode.deep and not mixed
     return video_writer(
         path,
         size_px=run.size_px,
         clock=clock_of(run.table.pts_s[list(rows)], run.picture_fps),
-        colour=clip.facts.colour,
+        colour=clip.facts.colour if own else shown_colour(clip.facts.colour),
         pixel_aspect=clip.facts.pixel_aspect,
         sound_of=clip.facts.path if sound else None,
         sound_from_s=float(run.table.pts_s[rows[0]]),
         options=encode,
     )
+
+
+def to_8_bits(picture: NDArray[Any]) -> NDArray[np.uint8]:
+    """A picture of uint8 as it is; of uint16, 0..65535, rounded."""
+    if picture.dtype == np.uint8:
+        return picture
+    return ((picture.astype(np.uint32) + DEEP // 2) // DEEP).astype(np.uint8)
+
+
+def full_scale(picture: NDArray[Any]) -> float:
+    """White of a picture: 255, or 65535 of a deep one."""
+    return float(np.iinfo(picture.dtype).max)
 
 
 def stretches(run: OpenedRun, rows: Sequence[int]) -> tuple[Stretch, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.progress import Progress, silent
-from pipelines.render.encode import EncodeOptions, clock_of, video_writer
+from pipelines.render.encode import EncodeOptions, clock_of, shown_colour, video_writer
 from pipelines.render.job import Rendered
 from pipelines.render.opened import OpenedRun, one_shot
 from pipelines.render.paths import read_move
@@ -68,7 +68,7 @@ def move(
         path,
         size_px=size,
         clock=clock_of(seconds, fps),
-        colour=run.record.clip.get("colour") or {},
+        colour=shown_colour(run.record.clip.get("colour") or {}),
         options=encode,
     ) as writer:
         progress("move", 0, n)

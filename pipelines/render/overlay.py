@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -21,7 +21,15 @@ from pipelines.progress import Progress, silent
 from pipelines.rays import pan_tilt_to_ray
 from pipelines.render.encode import EncodeOptions
 from pipelines.render.inlay import Inlay, draw, place, read_picture
-from pipelines.render.job import Rendered, chosen_rows, pictures, stretches, writer_like
+from pipelines.render.job import (
+    Rendered,
+    chosen_rows,
+    full_scale,
+    pictures,
+    stretches,
+    to_8_bits,
+    writer_like,
+)
 from pipelines.render.matte import MatteOptions, difference, front_matte
 from pipelines.render.opened import OpenedRun, one_shot, open_its_clip
 from pipelines.render.plate import Plate, fit_light, read_plate
@@ -82,9 +90,9 @@ def overlay(
     covered = unknown = 0.0
     with (
         open_its_clip(run, options.clip) as clip,
-        writer_like(run, clip, rows, path, sound=options.sound, encode=encode) as writer,
+        writer_like(run, clip, rows, path, sound=options.sound, encode=encode, mixed=True) as writer,
     ):
-        for row, picture in pictures(run, clip, rows, progress, "overlay"):
+        for row, picture in pictures(run, clip, rows, progress, "overlay", encode, mixed=True):
             if row in views:
                 found = inserted(picture, inlay, views[row], plate, options)
                 if found is not None:
@@ -137,11 +145,11 @@ def corner_rays(run: OpenedRun, index: int, views: dict[int, View], options: Ove
 
 
 def inserted(
-    picture: NDArray[np.uint8], inlay: Inlay, view: View, plate: Plate | None, options: OverlayOptions
-) -> tuple[NDArray[np.uint8], float, float] | None:
+    picture: NDArray[Any], inlay: Inlay, view: View, plate: Plate | None, options: OverlayOptions
+) -> tuple[NDArray[Any], float, float] | None:
     """A frame with the inlay in it; px that it covers, and px of those where the plate was never seen.
 
-    None where the inlay is not in the picture.
+    picture: uint8, or uint16 of 0..65535. None where the inlay is not in the picture.
     """
     found = draw(inlay, view)
     if found is None:
@@ -152,13 +160,14 @@ def inserted(
     if area == 0:
         return None
     if plate is not None:
-        front, known = players_in_front(picture, view, plate, (rows, columns), options.matte)
+        front, known = players_in_front(to_8_bits(picture), view, plate, (rows, columns), options.matte)
         blind = float(((rgba[..., 3] > 0) & ~known).sum())
         rgba = rgba * (1 - front[..., None])
     out = picture.copy()
     under = out[rows, columns].astype(np.float32)
-    mixed = under * (1 - rgba[..., 3:] / 255) + rgba[..., :3]
-    out[rows, columns] = np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
+    white = full_scale(picture)
+    mixed = under * (1 - rgba[..., 3:] / 255) + rgba[..., :3] * np.float32(white / 255)
+    out[rows, columns] = np.clip(mixed + 0.5, 0, white).astype(picture.dtype)
     return out, area, blind
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from pipelines.progress import Progress, silent
 from pipelines.render.encode import EncodeOptions
-from pipelines.render.job import Rendered, chosen_rows, pictures, stretches, writer_like
+from pipelines.render.job import (
+    Rendered,
+    chosen_rows,
+    full_scale,
+    pictures,
+    stretches,
+    to_8_bits,
+    writer_like,
+)
 from pipelines.render.opened import OpenedRun, open_its_clip
 from pipelines.render.paths import smoothed
 from pipelines.render.plate import Plate, fit_light, read_plate
@@ -76,9 +84,13 @@ def stabilise(
     unseen = 0.0
     with (
         open_its_clip(run, options.clip) as clip,
-        writer_like(run, clip, rows, path, sound=options.sound, encode=encode) as writer,
+        writer_like(
+            run, clip, rows, path, sound=options.sound, encode=encode, mixed=plates is not None
+        ) as writer,
     ):
-        for row, picture in pictures(run, clip, rows, progress, "stabilised"):
+        for row, picture in pictures(
+            run, clip, rows, progress, "stabilised", encode, mixed=plates is not None
+        ):
             if row in sources:
                 plate = plates.of(int(run.table.shot[row])) if plates else None
                 picture, share = held_still(picture, sources[row], targets[row], plate)
@@ -128,30 +140,34 @@ def target_views(
 
 
 def held_still(
-    picture: NDArray[np.uint8], source: View, target: View, plate: Plate | None
-) -> tuple[NDArray[np.uint8], float]:
-    """A frame (h, w, 3) as the target sees it, its border filled from a plate if there is one; share left black."""
+    picture: NDArray[Any], source: View, target: View, plate: Plate | None
+) -> tuple[NDArray[Any], float]:
+    """A frame (h, w, 3) as the target sees it, its border filled from a plate if there is one; share left black.
+
+    picture: uint8, or uint16 of 0..65535.
+    """
     map_x, map_y = warp_map(source, target)
     inside = seen(map_x, map_y, source.size_px)
     ratio = _scale_ratio(map_x, map_y)
     if ratio > FINER:
-        picture = cv2.GaussianBlur(picture, (0, 0), 0.5 * float(np.sqrt(ratio**2 - 1))).astype(
-            np.uint8, copy=False
+        picture = np.asarray(
+            cv2.GaussianBlur(picture, (0, 0), 0.5 * float(np.sqrt(ratio**2 - 1))), picture.dtype
         )
-    moved: NDArray[np.uint8] = cv2.remap(
-        picture, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-    ).astype(np.uint8, copy=False)
+    moved: NDArray[Any] = np.asarray(
+        cv2.remap(picture, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), picture.dtype
+    )
     if plate is None:
         moved[~inside] = 0
         return moved, float(1 - inside.mean())
     behind, known = plate.seen_by(target)
-    light = fit_light(moved, behind, known & inside)
+    light = fit_light(to_8_bits(moved), behind, known & inside)
     w, h = source.size_px
     to_border = np.minimum(np.minimum(map_x + 0.5, w - 0.5 - map_x), np.minimum(map_y + 0.5, h - 0.5 - map_y))
     mixed = (to_border < FEATHER_PX) & known
     weight = np.clip(to_border[mixed] / FEATHER_PX, 0.0, 1.0)[:, None]
-    filled = weight * moved[mixed] + (1 - weight) * light.applied(behind[mixed])
-    moved[mixed] = np.clip(filled + 0.5, 0, 255).astype(np.uint8)
+    white = full_scale(moved)
+    filled = weight * moved[mixed] + (1 - weight) * light.applied(behind[mixed]) * (white / 255)
+    moved[mixed] = np.clip(filled + 0.5, 0, white).astype(moved.dtype)
     empty = ~(inside | known)
     moved[empty] = 0
     return moved, float(empty.mean())
