@@ -127,7 +127,7 @@ class OverlayOptions(Section):
         gt=0,
         le=255,
         description=(
-            "grey levels per quarter-size px; edge strength of the mean picture that seeds a graphic: "
+            "grey levels per reduced px; edge strength of the mean picture that seeds a graphic: "
             "moving scenes average out"
         ),
     )

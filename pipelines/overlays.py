@@ -1,6 +1,6 @@
 """What is fixed to the screen while the scene moves: scoreboards, logos, letterbox bars. A mask of the usable scene.
 
-Running statistics at a quarter of the size over frames between which the camera has moved: where the camera rests,
+Running statistics at a quarter of the size (half, in small pictures) over frames between which the camera has moved: where the camera rests,
 everything looks fixed. Edges that stay where they are while the scene passes seed a graphic; the pixels between them
 that hardly change fill it (seeds alone find 70 % of a board, small deviation alone takes flat grass along).
 Not found: graphics that appear for fewer than `min_samples` samples; those are the robust weights' business.
@@ -19,16 +19,18 @@ from scipy import ndimage
 from pipelines.config import OverlayOptions
 from pipelines.errors import ConfigError
 
-SCALE = 4  # a graphic narrower than two such pixels is below what registration notices
+# Small pixels are 4 px wide, in pictures narrower than FINE_BELOW_PX 2: what is lost of the scene lies along the rims of
+# graphics, a small pixel deep, and the smaller the picture the larger is the share of its pixels that are rim.
+COARSE, FINE, FINE_BELOW_PX = 4, 2, 1000
 MEMORY = 60  # samples after which old ones fade, so that a board that goes away is let go
 EARLY, SPARSE = 3, 5  # times min_samples of them come fast; then so many times rarer: they cost 4 ms at 1080p
 MOVING_PX = 0.5  # motion per frame below which the camera rests; jitter must not add up to a pan
 # Mean edge strength over its standard error. Samples so near to each other share some of their scene, so Student's t is
 # too hopeful: a graphic needs strong seeds, and weak ones belong to it that lie near those.
 STRONG_T, SEED_T = 10.0, 5.0
-NEAR_STRONG = 2  # quarter px; three times that when samples come rarely
-JOIN = 4  # quarter px; seeds this near belong to one graphic: the gap between two words
-MIN_SEEDS = 6  # of each direction in a graphic
+NEAR_STRONG_PX = 8  # three times that when samples come rarely
+JOIN_PX = 20  # seeds this near belong to one graphic: the gap between two words
+SEEDS_PX = 24  # length of the edges of each direction in a graphic
 DARK_GREY = (
     24.0  # limited-range black is 16; coding noise adds some (formats: 99th percentile <= 24 gave exact bars)
 )
@@ -44,7 +46,8 @@ class OverlayFinder:
         self.options = options or OverlayOptions()
         w, h = size_px
         self._given = None if self.options.mask_file is None else read_mask(self.options.mask_file, size_px)
-        small = (h // SCALE, w // SCALE)
+        self._scale = COARSE if w >= FINE_BELOW_PX else FINE
+        small = (h // self._scale, w // self._scale)
         self.n_samples = 0
         self._since_px = np.inf
         self._moments: NDArray[np.float32] = np.zeros(
@@ -90,7 +93,7 @@ class OverlayFinder:
         return self._analyse()[1]
 
     def _sample(self, gray: NDArray[Any]) -> None:
-        small = _shrink(gray)
+        small = _shrink(gray, self._scale)
         gy, gx = np.gradient(small)
         self.n_samples += 1
         weight = np.float32(1.0 / min(self.n_samples, MEMORY))
@@ -170,29 +173,32 @@ class OverlayFinder:
         edge_x = np.where(mean_x > self.options.min_gradient_grey, mean_x / np.maximum(std_x, 1e-3), 0.0)
         edge_y = np.where(mean_y > self.options.min_gradient_grey, mean_y / np.maximum(std_y, 1e-3), 0.0)
         strong_x, strong_y = (edge > max(1.0, STRONG_T / np.sqrt(n)) for edge in (edge_x, edge_y))
-        reach = NEAR_STRONG if self._is_early else 3 * NEAR_STRONG
+        reach = (1 if self._is_early else 3) * NEAR_STRONG_PX // self._scale
+        join = JOIN_PX // self._scale
         near = ndimage.binary_dilation(strong_x | strong_y, _disc(reach))
         seeds = near & (np.maximum(edge_x, edge_y) > max(1.0, SEED_T / np.sqrt(n)))
         fixed = std < self.options.max_std_grey
-        groups, n_groups = ndimage.label(ndimage.binary_dilation(seeds, _disc(JOIN)))
+        groups, n_groups = ndimage.label(ndimage.binary_dilation(seeds, _disc(join)))
         found = np.zeros_like(seeds)
         for group, box in zip(range(1, n_groups + 1), ndimage.find_objects(groups), strict=True):
             mine = groups[box] == group
             # The top edge of the hoardings stays in its row while the camera pans: a graphic has edges both ways.
-            if min((strong_x[box] & mine).sum(), (strong_y[box] & mine).sum()) < MIN_SEEDS:
+            if min((strong_x[box] & mine).sum(), (strong_y[box] & mine).sum()) < SEEDS_PX // self._scale:
                 continue
             own = seeds[box] & mine
             inside = own | (_between(own) & fixed[box])
-            inside = ndimage.binary_closing(np.pad(inside, JOIN), _disc(2))[JOIN:-JOIN, JOIN:-JOIN]
+            gap = join // 2
+            inside = ndimage.binary_closing(np.pad(inside, join), _disc(gap))[join:-join, join:-join]
+            inside |= _bridged(inside, 2 * join) & fixed[box]
             found[box] |= _fill_small_holes(inside, found.size // 50)
         return self._to_full(found)
 
     def _to_full(self, found: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], list[dict[str, int]]]:
         w, h = self.size_px
         full = np.zeros((h, w), bool)
-        blocks = np.kron(found, np.ones((SCALE, SCALE), bool))
+        blocks = np.kron(found, np.ones((self._scale, self._scale), bool))
         full[: blocks.shape[0], : blocks.shape[1]] = blocks
-        # What the quarter size left over at the right and at the bottom continues its neighbour.
+        # What the reduction left over at the right and at the bottom continues its neighbour.
         full[:, blocks.shape[1] :] = full[:, blocks.shape[1] - 1 : blocks.shape[1]]
         full[blocks.shape[0] :] = full[blocks.shape[0] - 1 : blocks.shape[0]]
         if self.options.dilate_px and full.any():
@@ -240,17 +246,17 @@ def _boxes(covered: NDArray[np.bool_]) -> list[dict[str, int]]:
     return boxes
 
 
-def _shrink(gray: NDArray[Any]) -> NDArray[np.float32]:
-    """Means of SCALE x SCALE blocks; a remainder at the right and at the bottom is left out."""
-    h, w = gray.shape[0] // SCALE, gray.shape[1] // SCALE
+def _shrink(gray: NDArray[Any], scale: int) -> NDArray[np.float32]:
+    """Means of scale x scale blocks; a remainder at the right and at the bottom is left out."""
+    h, w = gray.shape[0] // scale, gray.shape[1] // scale
     # Whole columns first: adding four strided views is three times faster than one reshaped mean.
-    rows = np.zeros((h, w * SCALE), np.float32)
-    for i in range(SCALE):
-        rows += gray[i : h * SCALE : SCALE, : w * SCALE]
-    small = rows[:, 0::SCALE].copy()
-    for i in range(1, SCALE):
-        small += rows[:, i::SCALE]
-    small /= np.float32(SCALE * SCALE)
+    rows = np.zeros((h, w * scale), np.float32)
+    for i in range(scale):
+        rows += gray[i : h * scale : scale, : w * scale]
+    small = rows[:, 0::scale].copy()
+    for i in range(1, scale):
+        small += rows[:, i::scale]
+    small /= np.float32(scale * scale)
     return small
 
 
@@ -274,6 +280,13 @@ def _between(seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return before & after
 
     return both_sides(seeds, 0) & both_sides(seeds, 1)
+
+
+def _bridged(mask: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """The mask with gaps of up to `longest` px in its rows closed: a bar whose edges have the scene's grey there."""
+    row = np.ones((1, longest + 1), bool)
+    padded = np.pad(mask, ((0, 0), (longest, longest)))
+    return np.asarray(ndimage.binary_closing(padded, row)[:, longest : mask.shape[1] + longest], np.bool_)
 
 
 def _fill_small_holes(mask: NDArray[np.bool_], largest: int) -> NDArray[np.bool_]:
