@@ -27,6 +27,9 @@ from mosaic.tiles import Layers, paint
 from mosaic.views import CompositeOptions, Lattice
 
 SMALL_WIDTH_PX = 320  # frames are compared at about this width
+# Of the composite that they are compared with: some 65 bytes a pixel are held at a time (measured: 950 MiB for the 14.7
+# million of a 59-megapixel panorama of 640x360 frames). A larger one is compared at a smaller scale.
+MOST_SMALL_PX = 5_000_000
 DISTRUSTED = 2  # of 255: what seems to move still counts where nothing else is there
 DIFFERENT_GREY = (
     14.0  # a difference beyond this and 2 x the spread of the views is one; codec noise of a mean is 2..4
@@ -53,15 +56,16 @@ Planes = list[NDArray[np.uint8]]
 
 
 def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.uint8]]:
-    """A plane (h / m, w / m) uint8 per view, m about w / 320: 255 at rest, DISTRUSTED where something moves. And a
-    plane over the surface at the same scale: 1 where all views agree.
+    """A plane (h / m, w / m) uint8 per view, m about w / 320, more in a huge panorama: 255 at rest, DISTRUSTED where
+    something moves. And a plane over the surface at the same scale: 1 where all views agree.
 
     scene.still, when given, is where the rounds start, and what is low there stays low. Raises ValueError for no
     round."""
     if scene.options.motion_rounds < 1:
         raise ValueError(f"{scene.options.motion_rounds} rounds find nothing")
     width = scene.views[0].size_px[0]
-    shrink = max(1, round(width / SMALL_WIDTH_PX))
+    area = scene.surface.width * scene.surface.height
+    shrink = max(1, round(width / SMALL_WIDTH_PX), int(np.ceil(np.sqrt(area / MOST_SMALL_PX))))
     small = _small_scene(scene, shrink)
     nodes = [_map_nodes(placement, small.surface, shrink) for placement in scene.views]
     everywhere = np.full((1, 1), 255, np.uint8)
