@@ -1,8 +1,9 @@
 """What is fixed to the screen while the scene moves: scoreboards, logos, letterbox bars. A mask of the usable scene.
 
-Running statistics at a quarter of the size (half, in small pictures) over frames between which the camera has moved: where the camera rests,
-everything looks fixed. Edges that stay where they are while the scene passes seed a graphic; the pixels between them
-that hardly change fill it (seeds alone find 70 % of a board, small deviation alone takes flat grass along).
+Running statistics at a quarter of the size (half, in small pictures) over frames between which the camera has moved:
+where the camera rests, everything looks fixed. Edges that stay where they are while the scene passes seed a graphic;
+the pixels between them that hardly change fill it (seeds alone find 70 % of a board, small deviation alone takes flat
+grass along).
 Not found: graphics that appear for fewer than `min_samples` samples; those are the robust weights' business.
 """
 
@@ -19,8 +20,8 @@ from scipy import ndimage
 from pipelines.config import OverlayOptions
 from pipelines.errors import ConfigError
 
-# Small pixels are 4 px wide, in pictures narrower than FINE_BELOW_PX 2: what is lost of the scene lies along the rims of
-# graphics, a small pixel deep, and the smaller the picture the larger is the share of its pixels that are rim.
+# Small pixels are 4 px wide, in pictures narrower than FINE_BELOW_PX 2: what is lost of the scene lies along the rims
+# of graphics, a small pixel deep, and the smaller the picture the larger is the share of its pixels that are rim.
 COARSE, FINE, FINE_BELOW_PX = 4, 2, 1000
 MEMORY = 60  # samples after which old ones fade, so that a board that goes away is let go
 EARLY, SPARSE = 3, 5  # times min_samples of them come fast; then so many times rarer: they cost 4 ms at 1080p
