@@ -1,9 +1,8 @@
 """What is fixed to the screen while the scene moves: scoreboards, logos, letterbox bars. A mask of the usable scene.
 
-Running statistics at a quarter of the size (half, in small pictures) over frames between which the camera has moved:
-where the camera rests, everything looks fixed. Edges that stay where they are while the scene passes seed a graphic;
-the pixels between them that hardly change fill it (seeds alone find 70 % of a board, small deviation alone takes flat
-grass along).
+Running statistics of a reduced picture over frames between which the camera has moved: where it rests, everything
+looks fixed. Edges that stay where they are while the scene passes seed a graphic; the pixels between them that hardly
+change fill it (seeds alone find 70 % of a board, small deviation alone takes flat grass along).
 Not found: graphics that appear for fewer than `min_samples` samples; those are the robust weights' business.
 """
 
@@ -20,17 +19,18 @@ from scipy import ndimage
 from pipelines.config import OverlayOptions
 from pipelines.errors import ConfigError
 
-# Small pixels are 4 px wide, in pictures narrower than FINE_BELOW_PX 2: what is lost of the scene lies along the rims
-# of graphics, a small pixel deep, and the smaller the picture the larger is the share of its pixels that are rim.
-COARSE, FINE, FINE_BELOW_PX = 4, 2, 1000
+# A small pixel is the width / SMALL_WIDTH wide, 2 to 4 px: what is lost of the scene lies along the rims of graphics, a
+# small pixel deep, and the smaller the picture the larger is the share of its pixels that are rim.
+SMALL_WIDTH, FINEST, COARSEST = 480, 2, 4
 MEMORY = 60  # samples after which old ones fade, so that a board that goes away is let go
 EARLY, SPARSE = 3, 5  # times min_samples of them come fast; then so many times rarer: they cost 4 ms at 1080p
 MOVING_PX = 0.5  # motion per frame below which the camera rests; jitter must not add up to a pan
 # Mean edge strength over its standard error. Samples so near to each other share some of their scene, so Student's t is
 # too hopeful: a graphic needs strong seeds, and weak ones belong to it that lie near those.
 STRONG_T, SEED_T = 10.0, 5.0
-NEAR_STRONG_PX = 8  # three times that when samples come rarely
-JOIN_PX = 20  # seeds this near belong to one graphic: the gap between two words
+# Shares of the width, because graphics grow with the picture.
+NEAR_STRONG = 1 / 80  # three times that when samples come rarely
+JOIN = 1 / 32  # seeds this near belong to one graphic: the gap between two words
 SEEDS_PX = 24  # length of the edges of each direction in a graphic
 DARK_GREY = (
     24.0  # limited-range black is 16; coding noise adds some (formats: 99th percentile <= 24 gave exact bars)
@@ -47,7 +47,7 @@ class OverlayFinder:
         self.options = options or OverlayOptions()
         w, h = size_px
         self._given = None if self.options.mask_file is None else read_mask(self.options.mask_file, size_px)
-        self._scale = COARSE if w >= FINE_BELOW_PX else FINE
+        self._scale = min(max(round(w / SMALL_WIDTH), FINEST), COARSEST)
         small = (h // self._scale, w // self._scale)
         self.n_samples = 0
         self._since_px = np.inf
@@ -174,12 +174,13 @@ class OverlayFinder:
         edge_x = np.where(mean_x > self.options.min_gradient_grey, mean_x / np.maximum(std_x, 1e-3), 0.0)
         edge_y = np.where(mean_y > self.options.min_gradient_grey, mean_y / np.maximum(std_y, 1e-3), 0.0)
         strong_x, strong_y = (edge > max(1.0, STRONG_T / np.sqrt(n)) for edge in (edge_x, edge_y))
-        reach = (1 if self._is_early else 3) * NEAR_STRONG_PX // self._scale
-        join = JOIN_PX // self._scale
-        near = ndimage.binary_dilation(strong_x | strong_y, _disc(reach))
+        width = std.shape[1]
+        reach = max(2, round(width * NEAR_STRONG)) * (1 if self._is_early else 3)
+        join = max(4, round(width * JOIN))
+        near = _grown(strong_x | strong_y, reach)
         seeds = near & (np.maximum(edge_x, edge_y) > max(1.0, SEED_T / np.sqrt(n)))
         fixed = std < self.options.max_std_grey
-        groups, n_groups = ndimage.label(ndimage.binary_dilation(seeds, _disc(join)))
+        groups, n_groups = ndimage.label(_grown(seeds, join))
         found = np.zeros_like(seeds)
         for group, box in zip(range(1, n_groups + 1), ndimage.find_objects(groups), strict=True):
             mine = groups[box] == group
@@ -188,8 +189,7 @@ class OverlayFinder:
                 continue
             own = seeds[box] & mine
             inside = own | (_between(own) & fixed[box])
-            gap = join // 2
-            inside = ndimage.binary_closing(np.pad(inside, join), _disc(gap))[join:-join, join:-join]
+            inside = _closed(inside, join // 2)
             inside |= _bridged(inside, 2 * join) & fixed[box]
             found[box] |= _fill_small_holes(inside, found.size // 50)
         return self._to_full(found)
@@ -202,9 +202,8 @@ class OverlayFinder:
         # What the reduction left over at the right and at the bottom continues its neighbour.
         full[:, blocks.shape[1] :] = full[:, blocks.shape[1] - 1 : blocks.shape[1]]
         full[blocks.shape[0] :] = full[blocks.shape[0] - 1 : blocks.shape[0]]
-        if self.options.dilate_px and full.any():
-            away = cv2.distanceTransform((~full).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            full = away <= self.options.dilate_px
+        if self.options.dilate_px:
+            full = _grown(full, self.options.dilate_px)
         return full, _boxes(full)
 
 
@@ -301,6 +300,17 @@ def _fill_small_holes(mask: NDArray[np.bool_], largest: int) -> NDArray[np.bool_
     return mask | small[holes]
 
 
-def _disc(radius: int) -> NDArray[np.bool_]:
-    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-    return x**2 + y**2 <= radius**2
+def _grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """Everything within `radius` px of the mask; of an empty one nothing."""
+    if not mask.any():
+        return mask.copy()
+    away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(away <= radius, np.bool_)
+
+
+def _closed(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """The mask with what a disc of `radius` px cannot enter from outside."""
+    room = np.pad(mask, 2 * radius + 1)
+    return np.asarray(~_grown(~_grown(room, radius), radius), np.bool_)[
+        2 * radius + 1 : -2 * radius - 1, 2 * radius + 1 : -2 * radius - 1
+    ]
