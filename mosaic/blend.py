@@ -7,7 +7,7 @@ to use (views.py) and holds no picture (framestore.py).
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -71,17 +71,33 @@ def _linear(flat, stride, xi, yi, s, t):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def sample_view(  # type: ignore[no-untyped-def]
-    image, top, height, trust, still, grid, step, gain, margin, feather, cubic, out, out_vote, out_weight
+    image,
+    top,
+    height,
+    trust,
+    still,
+    grid,
+    step,
+    gain,
+    margin,
+    feather,
+    cubic,
+    out,
+    out_vote,
+    out_weight,
+    fine=None,
 ):
     """Sample one frame over one tile.
 
-    image (H, W, 3) uint8: the rows from `top` on of a frame `height` px high, all that the grid can reach. trust and
+    image (H, W, 3) uint8, or uint16 with a gain smaller by 257: the rows from `top` on of a frame `height` px high, all
+    that the grid can reach. trust and
     still: uint8 planes over the same frame at any resolution, 255 = the scene at
     rest, nearest pixel taken; a (1, 1) plane holds for the whole frame. grid (rows, columns, 4) float32: frame x, y,
     vote and weight 0..1 at every `step`-th tile pixel, linear in between. gain (3,) multiplies the channels. A sample
     nearer than `margin` px to the frame's border, or of trust, still or vote 0, is not seen; from there vote and weight
     rise over `feather` px, so that no frame edge shows. Both are multiplied by trust / 255 and by still / 255.
-    Out, uint8: out (3, h, w); out_vote (h, w), 0 = not seen, else at least 1; out_weight (h, w), likewise.
+    Out, uint8: out (3, h, w); out_vote (h, w), 0 = not seen, else at least 1; out_weight (h, w), likewise; fine
+    (3, h, w), where given: the sample less out, in 256ths of a grey level, 128 = none.
     Catmull-Rom (cubic) or linear, with float weights (cv2.remap rounds positions to 1/32 px).
     """
     width = image.shape[1]
@@ -142,6 +158,11 @@ def sample_view(  # type: ignore[no-untyped-def]
                 out[0, row, column] = np.uint8(min(max(r * gain_r + rounding, zero), full))
                 out[1, row, column] = np.uint8(min(max(g * gain_g + rounding, zero), full))
                 out[2, row, column] = np.uint8(min(max(b * gain_b + rounding, zero), full))
+                if fine is not None:
+                    top_fine, n = np.float32(255), np.float32(256)
+                    for channel, value in ((0, r * gain_r), (1, g * gain_g), (2, b * gain_b)):
+                        part = min(max(value, zero), full) + rounding - np.float32(out[channel, row, column])
+                        fine[channel, row, column] = np.uint8(min(max(part * n, zero), top_fine))
                 out_vote[row, column] = np.uint8(min(max(c * ramp + rounding, one), full))
                 out_weight[row, column] = np.uint8(min(max((w0 + dw * u) * ramp + rounding, one), full))
 
@@ -274,6 +295,13 @@ def _weighted_median(values, weights, n):  # type: ignore[no-untyped-def]
     return low
 
 
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _of_16_bits(grey, fine):  # type: ignore[no-untyped-def]
+    """0..65535 of a grey level and its 256ths as sample_view gives them."""
+    value = (grey + (fine - np.float32(128)) * np.float32(1 / 256)) * np.float32(257) + np.float32(0.5)
+    return np.uint16(min(max(value, np.float32(0)), np.float32(65535)))
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _densest(colour, votes, n, reach):  # type: ignore[no-untyped-def]
     """The view of n whose colour (3, n) most votes are near: sum of votes x (1 - distance / reach). Against the median
@@ -291,7 +319,22 @@ def _densest(colour, votes, n, reach):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n_seen, spread, support):  # type: ignore[no-untyped-def]
+def robust_value(  # type: ignore[no-untyped-def]
+    stack,
+    vote,
+    weight,
+    networks,
+    begin,
+    floor,
+    cap,
+    doubt,
+    out,
+    n_seen,
+    spread,
+    support,
+    fine=None,
+    deep=None,
+):
     """One colour a pixel from n views.
 
     stack (n, 3, N), vote (n, N), weight (n, N) uint8 as sample_view gives them; networks, begin = median_networks(n).
@@ -305,9 +348,10 @@ def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n
     One view: taken. Two: the one with more votes is the centre.
     Out, uint8: out (N, 3), n_seen (N,), spread (N,), support (N,) = 255 x share of the votes
     that are near the median, less where fewer than four views of some weight are: one trusted view among distrusted
-    ones is no majority.
+    ones is no majority. deep (N, 3) uint16, where given with fine (n, 3, N) of sample_view: the same colour, 0..65535.
     """
     n_views, _, size = stack.shape
+    rest = np.empty((3, _BLOCK), np.float32)
     rows = np.empty((n_views, _BLOCK), np.uint8)
     centre = np.empty((3, _BLOCK), np.uint8)
     apart = np.empty((n_views, _BLOCK), np.uint8)
@@ -342,6 +386,8 @@ def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n
                 strongest[p] = max(strongest[p], seen[p])
         if n == 0:
             out[start:stop] = 0
+            if fine is not None:
+                deep[start:stop] = 0
             n_seen[start:stop] = 0
             spread[start:stop] = 0
             support[start:stop] = 0
@@ -424,6 +470,7 @@ def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n
             median[p] = _weighted_median(values, votes, m) if count > 2 else 0
             spread[at] = np.uint8(min(np.float32(1.4826) * median[p] + np.float32(0.5), np.float32(255)))
         total[:] = 0
+        rest[:] = 0
         for i in range(n):
             k = present[i]
             r, g, b = stack[k, 0, start:stop], stack[k, 1, start:stop], stack[k, 2, start:stop]
@@ -440,6 +487,9 @@ def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n
                 total[5, p] += np.float32(seen[p])
                 strong = near & (np.int32(seen[p]) * 8 >= np.int32(strongest[p]))
                 total[6, p] += np.float32(1) if strong else np.float32(0)
+                if fine is not None:
+                    for c in range(3):
+                        rest[c, p] += w * fine[k, c, start + p]
         for p in range(length):
             at = start + p
             share = total[4, p] / max(total[5, p], np.float32(1))
@@ -449,6 +499,8 @@ def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n
             if total[3, p] > 0:
                 for c in range(3):
                     out[at, c] = np.uint8(total[c, p] / total[3, p] + np.float32(0.5))
+                    if fine is not None:
+                        deep[at, c] = _of_16_bits(total[c, p] / total[3, p], rest[c, p] / total[3, p])
             elif missing[p] < n:
                 nearest = -1
                 for i in range(n):
@@ -456,21 +508,39 @@ def robust_value(stack, vote, weight, networks, begin, floor, cap, doubt, out, n
                         nearest = i
                 for c in range(3):
                     out[at, c] = stack[present[nearest], c, at]
+                    if fine is not None:
+                        k = present[nearest]
+                        deep[at, c] = _of_16_bits(np.float32(stack[k, c, at]), np.float32(fine[k, c, at]))
             else:
                 for c in range(3):
                     out[at, c] = 0
+                    if fine is not None:
+                        deep[at, c] = 0
+
+
+class Blended(NamedTuple):
+    """What the views of a tile make: image (h, w, 3), n_seen, spread, support (h, w) uint8, see robust_value; deep
+    (h, w, 3) uint16: the image with more than 8 bits, where the views have them."""
+
+    image: NDArray[np.uint8]
+    n_seen: NDArray[np.uint8]
+    spread: NDArray[np.uint8]
+    support: NDArray[np.uint8]
+    deep: NDArray[np.uint16] | None
 
 
 def blend_stack(
     stack: NDArray[np.uint8],
     vote: NDArray[np.uint8],
     weight: NDArray[np.uint8],
+    fine: NDArray[np.uint8] | None = None,
     *,
     floor: float = 3.0,
     cap: float = 10.0,
     doubt: float = 6.0,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
-    """robust_value for a tile: stack (n, 3, h, w), vote, weight (n, h, w) -> image (h, w, 3), n_seen, spread, support.
+) -> Blended:
+    """robust_value for a tile: stack (n, 3, h, w), vote, weight (n, h, w), and fine, shaped as stack, where the sources
+    have more than 8 bits.
 
     floor, cap, doubt in grey levels, see robust_value. Raises ValueError for no view or more than 255.
     """
@@ -481,9 +551,14 @@ def blend_stack(
     n_seen: NDArray[Any] = np.empty(height * width, np.uint8)
     spread: NDArray[Any] = np.empty(height * width, np.uint8)
     support: NDArray[Any] = np.empty(height * width, np.uint8)
+    deep: NDArray[Any] | None = None if fine is None else np.empty((height * width, 3), np.uint16)
     robust_value(
         stack.reshape(n, 3, -1), vote.reshape(n, -1), weight.reshape(n, -1), *median_networks(n),
         np.float32(floor), np.float32(cap), np.float32(doubt), image, n_seen, spread, support,
+        None if fine is None else fine.reshape(n, 3, -1), deep,
     )  # fmt: skip
     plane = (height, width)
-    return image.reshape(*plane, 3), n_seen.reshape(plane), spread.reshape(plane), support.reshape(plane)
+    return Blended(
+        image=image.reshape(*plane, 3), n_seen=n_seen.reshape(plane), spread=spread.reshape(plane),
+        support=support.reshape(plane), deep=None if deep is None else deep.reshape(*plane, 3),
+    )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import os
 import tempfile
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +20,12 @@ class Canvas:
     def __init__(self, folder: str | os.PathLike[str], memory_bytes: int) -> None:
         self._folder, self._left, self._maps = folder, memory_bytes, list[mmap.mmap]()
 
-    def zeros(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        """A uint8 array of zeros. Raises OSError where the disk has no room for it."""
-        n_bytes = int(np.prod(shape))
+    def zeros(self, shape: tuple[int, ...], dtype: type[np.generic] = np.uint8) -> NDArray[Any]:
+        """An array of zeros. Raises OSError where the disk has no room for it."""
+        n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if n_bytes <= self._left:
             self._left -= n_bytes
-            return np.zeros(shape, np.uint8)
+            return np.zeros(shape, dtype)
         with tempfile.TemporaryFile(prefix="panorama-", dir=self._folder) as file:
             # Not a sparse file: on a full disk this raises, where writing to a page without a block would kill.
             if hasattr(os, "posix_fallocate"):
@@ -33,7 +34,7 @@ class Canvas:
                 file.truncate(n_bytes)
             pages = mmap.mmap(file.fileno(), n_bytes)
         self._maps.append(pages)
-        return np.frombuffer(pages, np.uint8).reshape(shape)
+        return np.frombuffer(pages, dtype).reshape(shape)
 
     def release(self) -> None:
         for pages in self._maps:

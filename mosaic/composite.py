@@ -35,7 +35,8 @@ class Panorama:
     image (h, w, 3) uint8 RGB; alpha (h, w) uint8, 0 where nothing was seen, else 255. n_seen (h, w) uint8: views
     that saw the pixel. spread (h, w) uint8: 1.4826 times the median distance of the views from the value, in grey
     levels (0 where fewer than 3 views). frames: those used. placements: of every frame of the shot, by number.
-    gains (len(frames), 3): what each frame's channels were multiplied by.
+    gains (len(frames), 3): what each frame's channels were multiplied by. deep (h, w, 3) uint16 of 0..65535: image
+    with more than 8 bits, where the frames have them.
     """
 
     image: NDArray[np.uint8]
@@ -46,6 +47,7 @@ class Panorama:
     frames: tuple[int, ...]
     placements: Mapping[int, Placement]
     gains: NDArray[np.float64]
+    deep: NDArray[np.uint16] | None = None
     canvas: Canvas | None = field(default=None, repr=False)
 
     def pixel_to_ray(self, xy: ArrayLike) -> NDArray[np.float64]:
@@ -107,12 +109,12 @@ def composite(
         still, quiet = find_still(scene)
         scene = replace(scene, still=still, quiet=quiet)
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
-    layers = paint(scene, canvas, progress)
+    layers = paint(replace(scene, deep=store.deep), canvas, progress)
     alpha = canvas.zeros(layers.n_seen.shape)
     np.multiply(layers.n_seen > 0, np.uint8(255), out=alpha, casting="unsafe")
     return Panorama(
         image=layers.image, alpha=alpha, surface=surface, n_seen=layers.n_seen, spread=layers.spread,
-        frames=tuple(p.frame for p in views), placements=by_frame, gains=gains, canvas=canvas,
+        frames=tuple(p.frame for p in views), placements=by_frame, gains=gains, deep=layers.deep, canvas=canvas,
     )  # fmt: skip
 
 

@@ -32,6 +32,7 @@ def crop_inside(panorama: Panorama, *, step_px: int | None = None) -> Panorama:
         alpha=panorama.alpha[box],
         n_seen=panorama.n_seen[box],
         spread=panorama.spread[box],
+        deep=None if panorama.deep is None else panorama.deep[box],
         surface=replace(
             surface,
             cx=surface.cx - left * step,

@@ -15,6 +15,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,13 +28,14 @@ COARSE = 16  # px of a frame per pixel of its coarse picture
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StoredFrame:
-    """rgb (h, w, 3) uint8; trust (h, w) uint8 or None: 0 = not the scene, 255 = scene at rest, None = 255 all over.
+    """rgb (h, w, 3) uint8, or uint16 where all bits were asked for; trust (h, w) uint8 or None: 0 = not the scene,
+    255 = scene at rest, None = 255 all over.
 
     Both are smaller by the whole factor `shrink` where a reduced copy was asked for: full px = shrink * px +
     (shrink - 1) / 2.
     """
 
-    rgb: NDArray[np.uint8]
+    rgb: NDArray[Any]
     trust: NDArray[np.uint8] | None
     shrink: int = 1
 
@@ -51,8 +53,15 @@ def _equal(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> bool:
     return a is b if a is None or b is None else np.array_equal(a, b)
 
 
+def eight_bits(picture: NDArray[Any]) -> NDArray[np.uint8]:
+    """A picture of 0..65535 in 0..255, rounded; one of uint8 as it is."""
+    if picture.dtype == np.uint8:
+        return picture
+    return np.asarray((picture.astype(np.uint32) + 128) // 257, np.uint8)
+
+
 class FrameStore:
-    """Scratch store of frames of one size. Safe to read from several threads; write from one.
+    """Scratch store of frames of one size and depth, 8 or 16 bits. Safe to read from several threads; write from one.
 
     folder: where the scratch file is made (removed again by close()). cache_bytes bounds the frames held in memory.
     mask_margin_px: a mask is widened by this much, because a codec smears an overlay's edge over its neighbours.
@@ -74,6 +83,7 @@ class FrameStore:
         handle, name = tempfile.mkstemp(prefix="frames-", suffix=".raw", dir=folder)
         self._file, self._path = handle, Path(name)
         self._end = 0
+        self._dtype: np.dtype[Any] | None = None  # of the pictures, as the first one has it
         self._offset: dict[int, int] = {}
         self._trust_of: dict[int, int] = {}  # frame -> offset of its trust plane
         self._trust_known: dict[bytes, int] = {}  # digest -> offset: a static overlay is stored once
@@ -81,18 +91,23 @@ class FrameStore:
         self._same: _Trust | None = None  # of the frame before: masks seldom change
         self._small: dict[int, tuple[int, int]] = {}  # frame -> offset and block side of its small picture
         self._coarse: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
-        self._cache: OrderedDict[tuple[int, int], StoredFrame] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, int, bool], StoredFrame] = OrderedDict()
         self._cached_bytes = 0
-        self._spare: list[NDArray[np.uint8]] = []
+        self._spare: list[NDArray[Any]] = []
         self._still: dict[int, NDArray[np.uint8]] = {}
         self._screen: NDArray[np.bool_] | None = None
-        self._loading: dict[tuple[int, int], threading.Event] = {}
+        self._loading: dict[tuple[int, int, bool], threading.Event] = {}
         self._lock = threading.Lock()
 
     @property
     def frames(self) -> tuple[int, ...]:
         """Frame numbers stored, in ascending order."""
         return tuple(sorted(self._offset))
+
+    @property
+    def deep(self) -> bool:
+        """Whether the pictures have more than 8 bits."""
+        return self._dtype == np.uint16
 
     @property
     def bytes_on_disk(self) -> int:
@@ -104,21 +119,25 @@ class FrameStore:
     def put(
         self,
         frame: int,
-        rgb: NDArray[np.uint8],
+        rgb: NDArray[Any],
         mask: NDArray[np.bool_] | None = None,
         trust: NDArray[np.uint8] | NDArray[np.floating] | None = None,
         small: NDArray[np.uint8] | None = None,
     ) -> None:
         """Store one frame.
 
-        rgb (h, w, 3) uint8. mask (h, w) bool, True = usable scene. trust (h, w): how sure it is that a pixel shows
-        the scene at rest, float 0..1 or uint8 0..255; low where something moves. small (h // s, w // s, 3): its mean
-        over blocks of s x s px, if the caller has it (any s of 2 or more): smaller pictures are then made from this
-        one. Raises ValueError on a wrong shape or dtype, or a frame that is already there.
+        rgb (h, w, 3) uint8, or uint16 of 0..65535; all alike. mask (h, w) bool, True = usable scene. trust (h, w): how
+        sure it is that a pixel shows the scene at rest, float 0..1 or uint8 0..255; low where something moves. small
+        (h // s, w // s, 3) uint8: its mean over blocks of s x s px, if the caller has it (any s of 2 or more): smaller
+        pictures are then made from this one. Raises ValueError on a wrong shape or dtype, or a frame that is already
+        there.
         """
         width, height = self.size_px
-        if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
-            raise ValueError(f"frame {frame} is {rgb.dtype} {rgb.shape}, need uint8 {(height, width, 3)}")
+        wanted = (self._dtype,) if self._dtype is not None else (np.dtype(np.uint8), np.dtype(np.uint16))
+        if rgb.shape != (height, width, 3) or rgb.dtype not in wanted:
+            raise ValueError(
+                f"frame {frame} is {rgb.dtype} {rgb.shape}, need {wanted[0]} {(height, width, 3)}"
+            )
         if frame in self._offset:
             raise ValueError(f"frame {frame} is stored already")
         coarse_size = (width // COARSE, height // COARSE)
@@ -128,10 +147,11 @@ class FrameStore:
             shrink = round(width / small.shape[1])
             if small.shape != (height // shrink, width // shrink, 3) or small.dtype != np.uint8 or shrink < 2:
                 raise ValueError(f"small is {small.dtype} {small.shape}, of a frame {(height, width, 3)}")
-        coarse = self._mean_over_blocks(rgb if small is None else small, shrink, COARSE)
-        if coarse is None:
-            coarse = self._mean_over_blocks(rgb, 1, COARSE)
-        assert coarse is not None
+        mean = self._mean_over_blocks(rgb if small is None else small, shrink, COARSE)
+        if mean is None:
+            mean = self._mean_over_blocks(rgb, 1, COARSE)
+        assert mean is not None
+        coarse = eight_bits(mean)
         if trust is not None or self._same is None or not _equal(self._same.mask, mask):
             plane = self._trust_plane(mask, trust)
             same = _Trust(mask=None if mask is None else mask.copy(), offset=None, coarse=None)
@@ -145,13 +165,12 @@ class FrameStore:
             self._trust_of[frame] = same.offset
         coarse_trust = np.full(coarse_size[::-1], 255, np.uint8) if same.coarse is None else same.coarse
         self._coarse[frame] = (coarse, coarse_trust)
+        self._dtype = rgb.dtype
         self._offset[frame] = self._append(np.ascontiguousarray(rgb))
         if small is not None:
             self._small[frame] = (self._append(np.ascontiguousarray(small)), shrink)
 
-    def _mean_over_blocks(
-        self, picture: NDArray[np.uint8], shrink: int, wanted: int
-    ) -> NDArray[np.uint8] | None:
+    def _mean_over_blocks(self, picture: NDArray[Any], shrink: int, wanted: int) -> NDArray[Any] | None:
         """A frame's mean over blocks of `wanted` px, from its picture of blocks of `shrink`; None: their edges do not
         meet."""
         size = (self.size_px[0] // wanted, self.size_px[1] // wanted)
@@ -159,7 +178,7 @@ class FrameStore:
         if width % shrink or height % shrink or wanted < shrink:
             return None
         cut = picture[: height // shrink, : width // shrink]
-        return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), picture.dtype)
 
     def put_still(self, frame: int, plane: NDArray[np.uint8]) -> None:
         """How sure it is that a frame's pixels are at rest, found later than its picture: (h, w) uint8 at any
@@ -216,7 +235,7 @@ class FrameStore:
             self._trust_known[digest] = self._append(np.ascontiguousarray(plane))
         return self._trust_known[digest]
 
-    def _append(self, array: NDArray[np.uint8]) -> int:
+    def _append(self, array: NDArray[Any]) -> int:
         offset, view = self._end, array.data.cast("B")
         while view:
             written = os.pwrite(self._file, view, self._end)
@@ -224,12 +243,12 @@ class FrameStore:
             view = view[written:]
         return offset
 
-    def _read(self, offset: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        array = self._buffer(shape)
+    def _read(self, offset: int, shape: tuple[int, ...], dtype: np.dtype[Any] | None = None) -> NDArray[Any]:
+        array = self._buffer(shape, dtype or np.dtype(np.uint8))
         self._fill(array, offset)
         return array
 
-    def _fill(self, array: NDArray[np.uint8], offset: int) -> None:
+    def _fill(self, array: NDArray[Any], offset: int) -> None:
         view = array.data.cast("B")
         while view:
             n_bytes = os.preadv(self._file, [view], offset)
@@ -238,9 +257,10 @@ class FrameStore:
             offset += n_bytes
             view = view[n_bytes:]
 
-    def get(self, frame: int, shrink: int = 1) -> StoredFrame:
-        """The frame, or its mean over blocks of shrink x shrink px. Raises KeyError for a frame not stored."""
-        key = (frame, shrink)
+    def get(self, frame: int, shrink: int = 1, *, deep: bool = False) -> StoredFrame:
+        """The frame, or its mean over blocks of shrink x shrink px, in 8 bits; deep: as it was stored. Raises KeyError
+        for a frame not stored."""
+        key = (frame, shrink, deep and self.deep)
         while True:
             with self._lock:
                 if key in self._cache:
@@ -252,7 +272,7 @@ class FrameStore:
                     break
             other.wait()  # another thread reads it just now
         try:
-            stored = self._load(frame, shrink)
+            stored = self._load(*key)
             with self._lock:
                 self._remember(key, stored)
         finally:
@@ -260,43 +280,44 @@ class FrameStore:
                 self._loading.pop(key).set()
         return stored
 
-    def rows(self, frame: int, first: int, last: int, buffer: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Rows first to last - 1 of a frame's picture, (last - first, w, 3), in `buffer`, a flat one of a frame's size
-        or more. Past the cache: who needs a part of many frames would only fill it. Raises KeyError for a frame not
-        stored."""
+    def rows(self, frame: int, first: int, last: int, buffer: NDArray[Any]) -> NDArray[Any]:
+        """Rows first to last - 1 of a frame's picture, (last - first, w, 3), as stored, in `buffer`, a flat one of that
+        dtype and a frame's size or more. Past the cache: who needs a part of many frames would only fill it. Raises
+        KeyError for a frame not stored."""
         stride = 3 * self.size_px[0]
         part = buffer[: (last - first) * stride]
-        self._fill(part, self._offset[frame] + first * stride)
+        self._fill(part, self._offset[frame] + first * stride * part.itemsize)
         return part.reshape(last - first, self.size_px[0], 3)
 
     def trust(self, frame: int) -> NDArray[np.uint8] | None:
         """The frame's trust plane (h, w) uint8 at full size, None = 255 all over."""
         return self._read_trust(frame)
 
-    def _load(self, frame: int, shrink: int) -> StoredFrame:
+    def _load(self, frame: int, shrink: int, deep: bool) -> StoredFrame:
         width, height = self.size_px
         trust = self._read_trust(frame)
         if shrink == 1:
-            return StoredFrame(rgb=self._read(self._offset[frame], (height, width, 3)), trust=trust)
+            whole = self._read(self._offset[frame], (height, width, 3), self._dtype)
+            return StoredFrame(rgb=whole if deep else eight_bits(whole), trust=trust)
         if trust is not None:
             trust = block_minimum(trust[: height // shrink * shrink, : width // shrink * shrink], shrink)
-        return StoredFrame(rgb=self._reduced(frame, shrink), trust=trust, shrink=shrink)
+        return StoredFrame(rgb=self._reduced(frame, shrink, deep), trust=trust, shrink=shrink)
 
-    def _reduced(self, frame: int, shrink: int) -> NDArray[np.uint8]:
+    def _reduced(self, frame: int, shrink: int, deep: bool) -> NDArray[Any]:
         width, height = self.size_px
-        if frame in self._small:
+        if frame in self._small and not deep:
             offset, side = self._small[frame]
             small = self._read(offset, (height // side, width // side, 3))
             reduced = self._mean_over_blocks(small, side, shrink)
             if reduced is not None:
                 return reduced
-        whole = self._read(self._offset[frame], (height, width, 3))
+        whole = self._read(self._offset[frame], (height, width, 3), self._dtype)
         reduced = self._mean_over_blocks(whole, 1, shrink)
         assert reduced is not None
         with self._lock:
             if len(self._spare) < 2:
                 self._spare.append(whole)
-        return reduced
+        return reduced if deep else eight_bits(reduced)
 
     def _read_trust(self, frame: int) -> NDArray[np.uint8] | None:
         offset = self._trust_of.get(frame)
@@ -310,7 +331,7 @@ class FrameStore:
             self._trust_kept = (offset, plane)
         return plane
 
-    def _remember(self, key: tuple[int, int], stored: StoredFrame) -> None:
+    def _remember(self, key: tuple[int, int, bool], stored: StoredFrame) -> None:
         if key in self._cache:
             return
         self._cache[key] = stored
@@ -322,14 +343,14 @@ class FrameStore:
             if len(self._spare) < 2 and sys.getrefcount(dropped) == 2 and sys.getrefcount(dropped.rgb) == 2:
                 self._spare.append(dropped.rgb)
 
-    def _buffer(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    def _buffer(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
         """An array to read into, if possible one that the cache dropped: fresh pages cost more than the reading (4 ms
         against 1 ms a 1080p frame), and the heap keeps holes of those that come and go."""
         with self._lock:
             for i, spare in enumerate(self._spare):
-                if spare.shape == shape:
+                if spare.shape == shape and spare.dtype == dtype:
                     return self._spare.pop(i)
-        return np.empty(shape, np.uint8)
+        return np.empty(shape, dtype)
 
     def coarse(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Mean colour (h/16, w/16, 3) and least trust (h/16, w/16) of blocks of 16 x 16 px, both uint8."""

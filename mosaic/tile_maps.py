@@ -29,7 +29,8 @@ class Scene:
     (h, w) uint8 per view over its frame, at any resolution: 255 = at rest, low = something moves there; None = all
     at rest. quiet: (h, w) uint8 over the surface at any resolution, not 0 where all views are known to agree; None =
     nowhere. map_error_px: how far the interpolated map may be from the exact one, in frame px. maps, fillers: where
-    given, tile_maps and fallback_maps of a tile are kept in them, for a scene that is painted more than once."""
+    given, tile_maps and fallback_maps of a tile are kept in them, for a scene that is painted more than once. deep:
+    paint with all the bits that the store has."""
 
     surface: Surface
     store: FrameStore
@@ -44,6 +45,7 @@ class Scene:
     map_error_px: float = 0.02
     maps: dict[tuple[int, int], list[TileMap]] | None = None
     fillers: dict[tuple[int, int], list[TileMap]] | None = None
+    deep: bool = False
 
 
 def fallback_maps(scene: Scene, x0: int, y0: int, empty: NDArray[np.bool_]) -> list[TileMap]:

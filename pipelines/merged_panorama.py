@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +38,16 @@ class JoinedStores:
     def __contains__(self, frame: int) -> bool:
         return frame in self._of
 
-    def get(self, frame: int, shrink: int = 1) -> StoredFrame:
-        """See FrameStore.get."""
-        return self._of[frame].get(frame, shrink)
+    @property
+    def deep(self) -> bool:
+        """See FrameStore.deep: shots of one clip are alike."""
+        return next(iter(self._of.values())).deep
 
-    def rows(self, frame: int, first: int, last: int, buffer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def get(self, frame: int, shrink: int = 1, *, deep: bool = False) -> StoredFrame:
+        """See FrameStore.get."""
+        return self._of[frame].get(frame, shrink, deep=deep)
+
+    def rows(self, frame: int, first: int, last: int, buffer: NDArray[Any]) -> NDArray[Any]:
         """See FrameStore.rows."""
         return self._of[frame].rows(frame, first, last, buffer)
 

@@ -58,7 +58,10 @@ def second_pass(
         if frame.index in planned:
             # Of a small clip the reduced picture is the picture itself, and the store makes its own smaller ones.
             reduced = small.rgb if small is not None and small.rgb.shape != picture().shape else None
-            store.put(frame.index, picture(), mask, small=reduced)
+            deep = (
+                frame.gray.dtype != np.uint8
+            )  # the source has more than 8 bits, and the panorama keeps them
+            store.put(frame.index, frame.deep_picture(True) if deep else picture(), mask, small=reduced)
         return small
 
     def judge(index: int, kept: Future[Small | None]) -> None:

@@ -1,5 +1,5 @@
 """panorama.tif: full resolution, tiled, deflate, levels of half size in SubIFDs, RGBA tagged sRGB, BigTIFF when
-large.
+large; 16 bits a channel, with the horizontal predictor, where the clip has more than 8.
 
 tifffile takes one tile at a time; each level is the mean over 2 x 2 px of the one above, weighted by alpha, so that
 unseen black does not darken the border of what was seen.
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import tifffile
@@ -45,17 +46,20 @@ def write_panorama_tiff(
     canvas = Canvas(scratch or tempfile.gettempdir(), memory_bytes)
     packet = gpano_xmp(panorama.surface) if panorama.surface.kind == "equirectangular" else None
     extra = [] if packet is None else [(700, "B", len(packet), packet, True)]
+    picture: NDArray[Any] = panorama.image if panorama.deep is None else panorama.deep
+    depth = picture.itemsize
     with (
         whole_file(path) as temporary,
-        tifffile.TiffWriter(temporary, bigtiff=width * height * 16 // 3 > BIG_BYTES) as writer,
+        tifffile.TiffWriter(temporary, bigtiff=width * height * 16 // 3 * depth > BIG_BYTES) as writer,
     ):
-        image, alpha = panorama.image, panorama.alpha
+        image, alpha = picture, panorama.alpha
         for level in range(n_levels):
             if level:
                 image, alpha = halve(image, alpha, canvas)
             writer.write(
                 _tiles(image, alpha),
-                shape=(*alpha.shape, 4), dtype=np.uint8, photometric="rgb", extrasamples=["unassalpha"],
+                shape=(*alpha.shape, 4), dtype=picture.dtype, photometric="rgb", extrasamples=["unassalpha"],
+                predictor=depth > 1,
                 tile=(TILE_PX, TILE_PX), compression="zlib", compressionargs={"level": compression_level},
                 maxworkers=threads, subifds=n_levels - 1 if level == 0 else None, subfiletype=1 if level else 0,
                 extratags=extra if level == 0 else [], software="broadcast-mosaic", metadata=None,
@@ -66,25 +70,26 @@ def write_panorama_tiff(
     return n_levels
 
 
-def _tiles(image: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
-    """RGBA tiles row by row, those at the border padded with transparent black."""
+def _tiles(image: NDArray[Any], alpha: NDArray[np.uint8]) -> Iterator[NDArray[Any]]:
+    """RGBA tiles row by row, those at the border padded with transparent black; alpha full where the colour is."""
+    full = np.iinfo(image.dtype).max // 255
     height, width = alpha.shape
     for y in range(0, height, TILE_PX):
         for x in range(0, width, TILE_PX):
-            tile = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
+            tile = np.zeros((TILE_PX, TILE_PX, 4), image.dtype)
             part = alpha[y : y + TILE_PX, x : x + TILE_PX]
             tile[: part.shape[0], : part.shape[1], :3] = image[y : y + TILE_PX, x : x + TILE_PX]
-            tile[: part.shape[0], : part.shape[1], 3] = part
+            tile[: part.shape[0], : part.shape[1], 3] = part.astype(image.dtype) * full
             yield tile
 
 
 def halve(
-    image: NDArray[np.uint8], alpha: NDArray[np.uint8], canvas: Canvas
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    image: NDArray[Any], alpha: NDArray[np.uint8], canvas: Canvas
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """Means over 2 x 2 px, colours weighted by alpha; an odd last row or column stands for two."""
     height, width = alpha.shape
     small = ((height + 1) // 2, (width + 1) // 2)
-    half_image, half_alpha = canvas.zeros((*small, 3)), canvas.zeros(small)
+    half_image, half_alpha = canvas.zeros((*small, 3), image.dtype.type), canvas.zeros(small)
     step = 256
     for row in range(0, small[0], step):
         source = np.s_[2 * row : 2 * (row + step)]

@@ -14,6 +14,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from mosaic.framestore import eight_bits
 from mosaic.surface import Surface
 from pipelines.errors import InputError
 from pipelines.exports.panorama_json import read_surface
@@ -87,7 +88,7 @@ def read_plate(path: Path) -> Plate:
     try:
         surface = read_surface(path.with_suffix(".json"))
         with tifffile.TiffFile(path) as tiff:
-            levels = tuple(level.asarray() for level in tiff.series[0].levels)
+            levels = tuple(eight_bits(level.asarray()) for level in tiff.series[0].levels)
     except (OSError, ValueError, KeyError, tifffile.TiffFileError) as error:
         raise InputError(path, f"cannot be read ({error})", "run again, into this folder") from None
     if levels[0].shape != (surface.height, surface.width, 4):

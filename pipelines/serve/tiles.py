@@ -12,6 +12,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from mosaic.framestore import eight_bits
 from pipelines.errors import InputError
 
 QUALITY = 88
@@ -67,4 +68,5 @@ class Tiles:
         tile = page.decode(data, index)[0]
         if tile is None:  # nothing was stored: an empty tile
             return np.zeros((self.tile_px, self.tile_px, 4), np.uint8)
-        return np.asarray(tile).reshape(-1, self.tile_px, 4) if tile.ndim != 3 else np.asarray(tile)
+        tile = eight_bits(np.asarray(tile))
+        return tile.reshape(-1, self.tile_px, 4) if tile.ndim != 3 else tile

@@ -10,7 +10,7 @@ from mosaic.composite import Canvas, CompositeOptions, FrameStore, composite, pl
 from mosaic.moving import NEAR, _near_bodies
 from mosaic.surface import choose_surface
 from tests.mosaic.pinhole import Pinhole, sweep
-from tests.mosaic.scenes import clean_plate, composite_of, picture, plan_of, psnr
+from tests.mosaic.scenes import clean_plate, composite_of, picture, plan_of, psnr, world_colour
 
 
 def shift_px(image, truth, where):
@@ -228,6 +228,40 @@ def test_same_input_same_bytes_whatever_the_threads_and_the_memory(tmp_path):
     for name in ("image", "alpha", "n_seen", "spread"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert not list(tmp_path.iterdir())  # neither the store nor the canvas leaves a file
+
+
+def deep_picture(placement):
+    """What the placement sees, uint16 RGB (h, w, 3): grey levels times 257, finer than 8 bits."""
+    xy = np.stack(np.meshgrid(*(np.arange(n) for n in placement.size_px)), axis=-1).astype(float)
+    return np.clip(np.rint(world_colour(placement.pixel_to_ray(xy), 20.0) * 257), 0, 65535).astype(np.uint16)
+
+
+@pytest.mark.parametrize("px_per_rad", [400.0, 190.0])
+def test_more_than_8_bits_come_out_as_they_went_in(tmp_path, px_per_rad):
+    frames = sweep((-9, 9), n=8, f_px=400.0, size_px=(240, 136))
+    surface = choose_surface(frames, "cylindrical", px_per_rad=px_per_rad)
+    panorama = composite_of(tmp_path, frames, surface, [deep_picture(p) for p in frames], gains=False)
+    seen, truth = panorama.n_seen >= 3, clean_plate(surface, 20.0)
+    error = panorama.deep[seen] / 257 - truth[seen]
+    assert np.sqrt(np.mean(error**2)) < 0.1  # 8 bits alone: 0.29
+    assert np.abs(panorama.deep[seen] / 257 - panorama.image[seen]).max() <= 1.01
+    assert (panorama.deep[panorama.alpha == 0] == 0).all()
+    assert composite_of(tmp_path, frames, surface, gains=False).deep is None
+
+
+def test_a_store_of_16_bits_gives_8_where_these_are_asked_for(tmp_path):
+    deep = np.random.default_rng(3).integers(0, 65536, (64, 96, 3)).astype(np.uint16)
+    with FrameStore(tmp_path, (96, 64)) as store:
+        store.put(1, deep)
+        assert store.deep
+        np.testing.assert_array_equal(store.get(1, deep=True).rgb, deep)
+        np.testing.assert_array_equal(store.get(1).rgb, np.rint(deep / 257).astype(np.uint8))
+        np.testing.assert_array_equal(store.rows(1, 20, 41, np.empty(deep.size, np.uint16)), deep[20:41])
+        half = deep.reshape(32, 2, 48, 2, 3).mean(axis=(1, 3))
+        np.testing.assert_allclose(store.get(1, 2, deep=True).rgb, half, atol=0.51)
+        np.testing.assert_allclose(store.get(1, 2).rgb, half / 257, atol=0.51)
+        with pytest.raises(ValueError, match="uint16"):
+            store.put(2, deep.astype(np.uint8))
 
 
 def test_tiles_do_not_show(tmp_path):

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -68,6 +69,27 @@ def test_tiff_is_tiled_deflated_and_exact(tmp_path):
     np.testing.assert_allclose(half[100, 150, :3], middle, atol=0.51)
     with Image.open(tmp_path / "panorama.tif") as picture:  # libtiff reads it too
         np.testing.assert_array_equal(np.asarray(picture), full)
+
+
+def deep_panorama():
+    """panorama_on's picture with 16 bits that 8 cannot hold."""
+    panorama = panorama_on(SURFACE)
+    below = np.random.default_rng(4).integers(-128, 129, panorama.image.shape)
+    return replace(panorama, deep=np.clip(panorama.image.astype(int) * 257 + below, 0, 65535).astype(np.uint16))
+
+
+def test_a_clip_of_more_than_8_bits_has_a_tiff_of_16(tmp_path):
+    panorama = deep_panorama()
+    write_panorama_tiff(panorama, tmp_path / "panorama.tif")
+    with tifffile.TiffFile(tmp_path / "panorama.tif") as tif:
+        assert tif.pages[0].dtype == np.uint16 and "sRGB" in ImageCms.getProfileDescription(
+            ImageCms.ImageCmsProfile(io.BytesIO(tif.pages[0].iccprofile))
+        )
+        full, half = (level.asarray() for level in tif.series[0].levels[:2])
+    np.testing.assert_array_equal(full[..., :3], panorama.deep)
+    np.testing.assert_array_equal(full[..., 3], panorama.alpha * np.uint16(257))
+    middle = panorama.deep[200:202, 300:302].mean(axis=(0, 1))
+    np.testing.assert_allclose(half[100, 150, :3], middle, atol=0.51)
 
 
 def test_tiff_and_jpeg_are_tagged_srgb(tmp_path):
@@ -348,6 +370,17 @@ def test_vips_opens_every_level_of_the_tiff(tmp_path):
         assert picture.size == (656, 286)
 
 
+@pytest.mark.oracle
+@pytest.mark.skipif(shutil.which("vips") is None, reason="libvips-tools is not installed")
+def test_vips_reads_16_bits(tmp_path):
+    panorama = deep_panorama()
+    write_panorama_tiff(panorama, tmp_path / "p.tif")
+    subprocess.run(["vips", "rawsave", f"{tmp_path / 'p.tif'}", f"{tmp_path / 'p.raw'}"], check=True)
+    rgba = np.fromfile(tmp_path / "p.raw", np.uint16).reshape(*panorama.alpha.shape, 4)
+    np.testing.assert_array_equal(rgba[..., :3], panorama.deep)
+    np.testing.assert_array_equal(rgba[..., 3], panorama.alpha * np.uint16(257))
+
+
 # --- whole files -----------------------------------------------------------------------------------------------------
 
 
@@ -355,9 +388,10 @@ def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "panorama.tif"
     path.write_text("old")
     broken = SimpleNamespace(
-        alpha=np.zeros((600, 600), np.uint8), image=None, surface=SURFACE, release=lambda: None, n_seen=None
-    )
-    with pytest.raises(TypeError):
+        alpha=np.zeros((600, 600), np.uint8), image=np.zeros((9, 9, 3), np.uint8), deep=None, surface=SURFACE,
+        release=lambda: None, n_seen=None,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="broadcast"):
         write_panorama_tiff(broken, path)
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["panorama.tif"]
 
