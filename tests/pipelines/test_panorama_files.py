@@ -75,7 +75,9 @@ def deep_panorama():
     """panorama_on's picture with 16 bits that 8 cannot hold."""
     panorama = panorama_on(SURFACE)
     below = np.random.default_rng(4).integers(-128, 129, panorama.image.shape)
-    return replace(panorama, deep=np.clip(panorama.image.astype(int) * 257 + below, 0, 65535).astype(np.uint16))
+    return replace(
+        panorama, deep=np.clip(panorama.image.astype(int) * 257 + below, 0, 65535).astype(np.uint16)
+    )
 
 
 def test_a_clip_of_more_than_8_bits_has_a_tiff_of_16(tmp_path):
