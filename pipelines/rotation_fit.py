@@ -31,8 +31,8 @@ SENTENCE = "No camera that only turns and zooms explains the pictures: people fi
 # 1.7; with 40 % players 1.4 to 3.0, at most 3.5.
 MISFIT_PX = 2.0
 # Where the keyframes are few, chi2_dof says less. Half of the gate's is enough if besides the cameras do not repeat the
-# measured steps: median px at W = 1280. Shots with a chi2_dof above 3 whose
-# cameras were right, or lost where not (crowds, 40 % players): .4 to 1.04; wrong ones: 1.3 to 7.
+# measured steps: median px at W = 1280. Shots with a chi2_dof above 3 whose cameras were right, or lost where not
+# (crowds, 40 % players): .4 to 1.04; wrong ones: 1.3 to 7.
 DOUBT_SHARE, DOUBT_STEP_PX = 0.5, 1.4
 # A measured step is contradicted by cameras that move the picture elsewhere by more than this share of the width. In
 # shots whose cameras are right 99 % of the steps stay below .013, in the refused real one half are off by 4 widths.
