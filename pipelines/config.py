@@ -293,6 +293,16 @@ class PanoramaOptions(Section):
     crop: Literal["none", "inside"] = Field(
         default="none", description="inside = cut to the largest rectangle that was seen without a gap"
     )
+    moments: int = Field(
+        default=0,
+        ge=0,
+        le=99,
+        description="panorama-moments.jpg too: the players of so many moments of the shot, evenly over it; 0 = none",
+    )
+    moment_frames: tuple[int, ...] = Field(
+        default=(),
+        description="the same of chosen pictures (the nearest ones kept), numbers with commas between",
+    )
     views: int = Field(
         default=17,
         ge=3,
@@ -301,6 +311,15 @@ class PanoramaOptions(Section):
             "frames whose median makes a pixel; 15 are as good as 50, odd keeps the median a real sample"
         ),
     )
+
+    @field_validator("moment_frames", mode="before")
+    @classmethod
+    def _numbers(cls, value: Any) -> Any:
+        if value is None:
+            return ()
+        if isinstance(value, int):
+            return (value,)
+        return tuple(part for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
 class OutputOptions(Section):

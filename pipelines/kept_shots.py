@@ -91,7 +91,12 @@ class ShotShelf:
         self._left -= n_bytes
         shot = KeptShot(
             index=index,
-            solved=replace(solved, panorama=None, store=None),
+            solved=replace(
+                solved,
+                panorama=None,
+                store=None,
+                trail=None if solved.trail is None else solved.trail.without_image(),
+            ),
             facts=tuple(facts),
             observations=tuple(replace(o, estimate=None) for o in tracker.observations),
             keyframes={k: Keyframe(k, key.template, key.small) for k, key in tracker.keyframes.items()},

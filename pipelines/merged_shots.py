@@ -20,6 +20,7 @@ from pipelines.kept_shots import KeptShot, ShotShelf, rest
 from pipelines.links import contradicted_frames, without_doubtful
 from pipelines.merged_panorama import panorama_of
 from pipelines.merging import Group, find_groups
+from pipelines.moments import trail
 from pipelines.output_folder import OutputFolder
 from pipelines.records import CameraTable, ShotRecord
 from pipelines.shot import CalibratedShot, frame_poses, placements_of
@@ -106,7 +107,11 @@ def _rewrite(
             [store], member.placements, config, scratch,
             lambda share: progress("merge", round(share * 100), 100),
         )  # fmt: skip
-        shot = replace(shot, panorama=panorama)
+        players = None
+        if shot.trail is not None:
+            moments = [k for k in shot.trail.frames if k in store and k in panorama.placements]
+            players = trail(panorama, store, moments, str(scratch))
+        shot = replace(shot, panorama=panorama, trail=players)
         name = f"shot-{index:03d}"
         files = (f"{name}/pairs.npz", *write_panorama(folder, name, shot, config, axes_of=group.first))
         facts = to_json(panorama_facts(panorama))
@@ -140,7 +145,7 @@ def _whole(
             stores, placements, config, scratch,
             lambda share: progress("merge", round(share * 100), 100),
         )  # fmt: skip
-        whole = replace(shot, panorama=panorama)
+        whole = replace(shot, panorama=panorama, trail=None)
         files += write_panorama(folder, name, whole, config, axes_of=group.first)
         facts = panorama_facts(panorama)
         facts["frames_of_shots"] = {

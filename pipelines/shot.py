@@ -37,6 +37,7 @@ from pipelines.keyframe_graph import (
     register_pairs,
 )
 from pipelines.links import contradicted_frames, without_doubtful
+from pipelines.moments import Trail, choose_moments, trail
 from pipelines.moving import MovingFinder
 from pipelines.pupil import with_pupil
 from pipelines.readout import with_readout, without_readout
@@ -96,6 +97,7 @@ class CalibratedShot:
     fits: tuple[PairFit, ...] = ()  # that the poses were solved from, with
     steps: tuple[PairFit, ...] = ()  # frame-to-frame pairs that are not among them
     store: FrameStore | None = None  # the panorama's frames, open, where they were asked for
+    trail: Trail | None = None  # the panorama with players, where asked for
     explained: RotationFit | None = None  # by a camera that turns and zooms; None: of shots merged into one
 
     @property
@@ -237,7 +239,7 @@ def solve_shot(
             placements = placements_of(fitting, world, tracker.observations, tracker.size_px, result.parallax)
             together = largest_piece(placements)
             placements = [p for p in placements if p.frame in together]
-            panorama = None
+            panorama, players = None, None
             if any(p.frame in store for p in placements):
                 panorama = composite(
                     plan, store, placements, surface, options, scratch=scratch,
@@ -245,6 +247,7 @@ def solve_shot(
                 )  # fmt: skip
                 if config.panorama.crop == "inside":
                     panorama = crop_inside(panorama)
+                players = _trail_of(panorama, store, plan, config, scratch)
         kept = keep_frames and panorama is not None
     finally:
         if not kept:
@@ -262,8 +265,22 @@ def solve_shot(
         solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
         rows=rows, panorama=panorama, no_panorama="" if panorama is not None else "no frame fits its camera",
         timings=timings, fits=tuple(fits), steps=tuple(steps), store=store if kept else None,
-        explained=explained,
+        explained=explained, trail=players,
     )  # fmt: skip
+
+
+def _trail_of(
+    panorama: Panorama, store: FrameStore, plan: ViewPlan, config: Config, scratch: Path
+) -> Trail | None:
+    """The panorama with the players of the moments that the configuration asks for; None: it asks for none here."""
+    options = config.panorama
+    stored = [k for k in plan.frames if k in store and k in panorama.placements]
+    wanted = [k for k in options.moment_frames if stored and stored[0] <= k <= stored[-1]]
+    if options.moment_frames and not wanted:
+        return None  # of another shot
+    if not (wanted or options.moments):
+        return None
+    return trail(panorama, store, choose_moments(stored, options.moments, wanted), str(scratch))
 
 
 def believed_level(head: Level, verdict: Verdict) -> Level:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -42,6 +43,8 @@ def write_shot(
     if shot.panorama is not None:
         files += write_panorama(folder, name, shot, config)
         panorama = panorama_facts(shot.panorama)
+        if shot.trail is not None:
+            panorama["moments"] = list(shot.trail.frames)
         shot.panorama.release()
     return shot_record(index, tracker, shot, files, panorama)
 
@@ -175,7 +178,7 @@ def thumbnails(tracker: ShotTracker) -> dict[int, bytes]:
 def write_panorama(
     folder: OutputFolder, name: str, shot: CalibratedShot, config: Config, *, axes_of: int | None = None
 ) -> list[str]:
-    """Stage panorama.tif, .jpg, .json and .pto of a shot, .png and .dzi where asked for; returns the names written.
+    """Stage panorama.tif, .jpg, .json and .pto of a shot; -moments.jpg, .png, .dzi where asked for. Returns names.
 
     axes_of: the shot whose axes the rays are in, where shots were merged.
     """
@@ -192,6 +195,10 @@ def write_panorama(
     write_panorama_jpeg(panorama, paths[1], max_width_px=config.output.jpeg_max_width)
     write_panorama_json(panorama, paths[2], world=world, parallax=_parallax_facts(panorama))
     write_pto(paths[3], panorama.surface, pto_frames(panorama))
+    if shot.trail is not None:
+        names.append(f"{name}/panorama-moments.jpg")
+        busy = replace(panorama, image=shot.trail.image)
+        write_panorama_jpeg(busy, folder.stage(names[-1]), max_width_px=config.output.jpeg_max_width)
     if config.output.png:
         names.append(f"{name}/panorama.png")
         write_panorama_png(panorama, folder.stage(names[-1]))
