@@ -14,21 +14,41 @@ if TYPE_CHECKING:
     from pipelines.config import load_config as load_config
     from pipelines.errors import UserError as UserError
     from pipelines.exports.formats import ExportOptions as ExportOptions
+    from pipelines.render.encode import EncodeOptions as EncodeOptions
+    from pipelines.render.move import MoveOptions as MoveOptions
+    from pipelines.render.overlay import OverlayOptions as OverlayOptions
+    from pipelines.render.stabilise import StabiliseOptions as StabiliseOptions
     from pipelines.result import Result as Result
     from pipelines.result import open_result as open_result
     from pipelines.result import process as process
 
 _HOMES = {
     "Config": "pipelines.config",
+    "EncodeOptions": "pipelines.render.encode",
     "ExportOptions": "pipelines.exports.formats",
+    "MoveOptions": "pipelines.render.move",
+    "OverlayOptions": "pipelines.render.overlay",
     "Result": "pipelines.result",
+    "StabiliseOptions": "pipelines.render.stabilise",
     "UserError": "pipelines.errors",
     "load_config": "pipelines.config",
     "open_result": "pipelines.result",
     "process": "pipelines.result",
 }
 
-__all__ = ["Config", "ExportOptions", "Result", "UserError", "load_config", "open_result", "process"]
+__all__ = [
+    "Config",
+    "EncodeOptions",
+    "ExportOptions",
+    "MoveOptions",
+    "OverlayOptions",
+    "Result",
+    "StabiliseOptions",
+    "UserError",
+    "load_config",
+    "open_result",
+    "process",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -66,7 +66,7 @@ def pitch(
     found = fitted(out, clicks, template, camera, click_px)
     import numpy as np
 
-    from pipelines.pitch import read_ball
+    from pipelines.clicks import read_ball
 
     if points is not None:
         frames, xy = read_ball(points)
@@ -119,7 +119,8 @@ def flight(
     found = fitted(out, clicks, template, camera, click_px)
     import numpy as np
 
-    from pipelines.pitch import MISFIT, read_ball
+    from pipelines.clicks import read_ball
+    from pipelines.pitch import MISFIT
     from pipelines.rays import rows_of
 
     frames, xy = read_ball(ball)
@@ -166,7 +167,8 @@ def fitted(out: Path | None, clicks: Path | None, template: str, camera: str, cl
     """The pitch camera that the options ask for. Raises usage errors, and InputError as pitch.pitch_of."""
     if out is None or clicks is None:
         raise typer.BadParameter("give the folder of a finished run and --clicks FILE")
-    from pipelines.pitch import pitch_of, read_clicks
+    from pipelines.clicks import read_clicks
+    from pipelines.pitch import pitch_of
 
     position = _numbers(camera, 3, "--camera") if camera else None
     known = template_named(template) if template else None
@@ -176,21 +178,13 @@ def fitted(out: Path | None, clicks: Path | None, template: str, camera: str, cl
 
 
 def template_named(text: str) -> PitchTemplate:
-    """football, football:100x64, ... Raises a usage error that lists the names."""
-    from pipelines.pitch_templates import TEMPLATES, football
+    """pitch_templates.template_named with a usage error."""
+    from pipelines.pitch_templates import template_named as named
 
-    name, _, size = text.partition(":")
-    if name == "football" and size:
-        length, _, width = size.partition("x")
-        try:
-            return football(float(length), float(width))
-        except ValueError:
-            raise typer.BadParameter(
-                f"the size of a football pitch is LENGTHxWIDTH in m, not {size!r}"
-            ) from None
-    if name not in TEMPLATES or size:
-        raise typer.BadParameter(f"no template is called {text!r}: {', '.join(TEMPLATES)}")
-    return TEMPLATES[name]()
+    try:
+        return named(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 def camera_facts(found: Pitch) -> dict[str, Any]:

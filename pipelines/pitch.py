@@ -1,14 +1,12 @@
 """Metres on the pitch from a finished run and a few clicks: the pitch camera of a shot, pixels to metres, ball flights.
 
-Clicks are a CSV: frame, x_px, y_px and either X_m, Y_m or `point`, a name of the template. All of one shot. The frame
-of the metres: `calib.pitch`; names and sizes of fields: pitch_templates.py.
+The frame of the metres: `calib.pitch`; clicks and how they are read: clicks.py; fields: pitch_templates.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +17,9 @@ from calib.pitch import PitchCamera, TrackCamera, fit_pitch_camera
 from calib.rotation import exp as rotation_exp
 from calib.rotation import from_pan_tilt_roll
 from pipelines.archive import read_camera_csv, read_run
-from pipelines.csv_input import read_csv_rows
+from pipelines.clicks import Clicks
 from pipelines.errors import InputError
 from pipelines.frame_geometry import MOST_ROUNDS, SETTLED_PX, FrameGeometry, frame_geometry
-from pipelines.pitch_templates import PitchTemplate
 from pipelines.rays import pixel_to_ray, rows_of
 from pipelines.records import CameraTable, RunRecord
 
@@ -32,17 +29,6 @@ CLICK_STD_PX = 1.0
 # Frames of a shot lie beside each other to this, px: an ordinary residual_px of camera.csv. It is added to every click.
 ALIGNMENT_STD_PX = 0.3
 MISFIT = 6.0  # chi2 per degree of freedom above which clicks and camera contradict each other
-CLICK_CURE = "it needs frame, x_px, y_px and X_m, Y_m (or point, a name of the template)"
-BALL_CURE = "it needs frame, x_px, y_px"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Clicks:
-    """n clicked points: frame (n,), xy_px (n, 2), XY_m (n, 2); lines of the file they are from, for messages."""
-
-    frame: NDArray[np.int64]
-    xy_px: FloatArray
-    XY_m: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -241,59 +227,3 @@ def fit_pitch(
         shot=shots[0], camera=camera, table=table, reference_frame=reference,
         clicked_frames=tuple(sorted(set(clicks.frame.tolist()))), pixel_std=std, geometry=geometry,
     )  # fmt: skip
-
-
-def read_clicks(path: Path, template: PitchTemplate | None = None) -> Clicks:
-    """A CSV of clicks. Raises InputError: no file, columns or rows; a name that the template lacks."""
-    header, rows = read_csv_rows(path, CLICK_CURE, encoding="utf-8-sig")
-    names = {name.strip(): name for name in header}
-    metric = {"X_m", "Y_m"} <= set(names)
-    if not {"frame", "x_px", "y_px"} <= set(names) or not (metric or "point" in names) or not rows:
-        raise InputError(path, "has no rows" if not rows else "lacks columns", CLICK_CURE)
-    if not metric and template is None:
-        raise InputError(path, "names points, but no template was chosen", "add --template")
-    points = [_metres(row, names, metric, template, path) for row in rows]
-    frame, xy = _frames_and_pixels(path, rows, names, CLICK_CURE)
-    return Clicks(frame=frame, xy_px=xy, XY_m=np.array(points))
-
-
-def read_ball(path: Path) -> tuple[NDArray[np.int64], FloatArray]:
-    """Frames (n,) and pixels (n, 2) of a ball from a CSV. Raises InputError as `read_clicks`."""
-    header, rows = read_csv_rows(path, BALL_CURE, encoding="utf-8-sig")
-    names = {name.strip(): name for name in header}
-    if not {"frame", "x_px", "y_px"} <= set(names) or not rows:
-        raise InputError(path, "has no rows" if not rows else "lacks columns", BALL_CURE)
-    return _frames_and_pixels(path, rows, names, BALL_CURE)
-
-
-def _frames_and_pixels(
-    path: Path, rows: Sequence[Mapping[str, str]], names: Mapping[str, str], cure: str
-) -> tuple[NDArray[np.int64], FloatArray]:
-    try:
-        frame = np.array([int(row[names["frame"]]) for row in rows], np.int64)
-        xy = np.array([[float(row[names["x_px"]]), float(row[names["y_px"]])] for row in rows])
-    except (TypeError, ValueError) as error:
-        raise InputError(path, f"a cell is no number ({error})", cure) from None
-    if not np.isfinite(xy).all():
-        raise InputError(path, "a pixel is not finite", cure)
-    return frame, xy
-
-
-def _metres(
-    row: Mapping[str, str], names: Mapping[str, str], metric: bool, template: PitchTemplate | None, path: Path
-) -> tuple[float, float]:
-    if metric and (row[names["X_m"]] or "").strip():
-        try:
-            return float(row[names["X_m"]]), float(row[names["Y_m"]])
-        except (TypeError, ValueError) as error:
-            raise InputError(path, f"a cell is no number ({error})", CLICK_CURE) from None
-    name = (row.get(names.get("point", "")) or "").strip()
-    if template is None or name not in template.points:
-        near = get_close_matches(name, template.points if template else [], 1)
-        cure = (
-            f"did you mean {near[0]!r}?"
-            if near
-            else "the names: broadcast-mosaic pitch --list-points TEMPLATE"
-        )
-        raise InputError(path, f"no point is called {name!r}", cure)
-    return template.points[name]

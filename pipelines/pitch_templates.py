@@ -136,3 +136,17 @@ TEMPLATES: dict[str, Callable[[], PitchTemplate]] = {
     "basketball": basketball,
     "american-football": american_football,
 }
+
+
+def template_named(text: str) -> PitchTemplate:
+    """'football', 'football:100x64' (length x width, m), 'basketball', ... Raises ValueError that lists the names."""
+    name, _, size = text.partition(":")
+    if name == "football" and size:
+        length, _, width = size.partition("x")
+        try:
+            return football(float(length), float(width))
+        except ValueError:
+            raise ValueError(f"the size of a football pitch is LENGTHxWIDTH in m, not {size!r}") from None
+    if name not in TEMPLATES or size:
+        raise ValueError(f"no template is called {text!r}: {', '.join(TEMPLATES)}")
+    return TEMPLATES[name]()

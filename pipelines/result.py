@@ -1,4 +1,4 @@
-"""A finished run as a Python user has it: arrays, tables for pandas and polars, rays, pairs, panorama, exports.
+"""A finished run as a Python user has it: arrays, tables, rays, metres on the pitch, new video, panorama, exports.
 
 `process(clip, out)` makes one, `open_result(out)` opens the folder of an earlier one. The files are the truth: nothing
 is computed here that they do not hold.
@@ -29,6 +29,13 @@ if TYPE_CHECKING:
     from pipelines.exports.exporter import Exported
     from pipelines.exports.formats import ExportOptions
     from pipelines.frame_geometry import FrameGeometry
+    from pipelines.pitch import Pitch
+    from pipelines.pitch_templates import PitchTemplate
+    from pipelines.render.encode import EncodeOptions
+    from pipelines.render.job import Rendered
+    from pipelines.render.move import MoveOptions
+    from pipelines.render.overlay import OverlayOptions
+    from pipelines.render.stabilise import StabiliseOptions
 
 FloatArray = NDArray[np.float64]
 
@@ -158,6 +165,66 @@ class Result:
     def pixel_to_pan_tilt(self, frame: ArrayLike, xy_px: ArrayLike) -> FloatArray:
         """Pan and tilt (..., 2) in degrees of pixels (..., 2) of frames (...)."""
         return rays.pixel_to_pan_tilt(self.camera, frame, xy_px, self.geometry())
+
+    # ---- the pitch, and new video
+
+    def pitch(
+        self,
+        clicks: str | Path | Sequence[Sequence[object]],
+        *,
+        template: str | PitchTemplate | None = None,
+        position_m: Sequence[float] | None = None,
+        click_std_px: float = 1.0,
+    ) -> Pitch:
+        """Where a shot's camera stands, from clicked points of the pitch: metres of pixels, pixels of metres, flights.
+
+        clicks: a CSV (see `clicks.read_clicks`), or rows (frame, x_px, y_px, name) or (frame, x_px, y_px, X_m, Y_m);
+        four or more, two where position_m (3,) of the camera is known. template: 'football', 'football:100x64',
+        'basketball', 'american-football', or your own. click_std_px: one-sigma error of a click. Raises InputError:
+        see `pitch.pitch_of`; ValueError: no such template.
+        """
+        from pipelines.clicks import clicks_of, read_clicks
+        from pipelines.pitch import fit_pitch
+        from pipelines.pitch_templates import template_named
+
+        known = template_named(template) if isinstance(template, str) else template
+        from_file = isinstance(clicks, (str, Path))
+        points = (
+            read_clicks(Path(clicks), known) if isinstance(clicks, (str, Path)) else clicks_of(clicks, known)
+        )
+        return fit_pitch(
+            self.run, self.camera, points, click_std_px=click_std_px, position_m=position_m,
+            source=clicks if from_file else "clicks",
+        )  # fmt: skip
+
+    def render(
+        self,
+        path: str | Path,
+        what: StabiliseOptions | OverlayOptions | MoveOptions,
+        *,
+        encode: EncodeOptions | None = None,
+        progress: Callable[[str, int, int | None], None] | None = None,
+    ) -> Rendered:
+        """New video at `path` (.mp4, .mov, .mkv): held still, with a picture in the scene, or a camera move.
+
+        What it is follows from the kind of options. Returns the facts of it. Raises InputError and OutputError as the
+        function of that name in pipelines.render.
+        """
+        from pipelines.progress import silent
+        from pipelines.render.move import MoveOptions, move
+        from pipelines.render.opened import open_run
+        from pipelines.render.overlay import OverlayOptions, overlay
+        from pipelines.render.stabilise import stabilise
+
+        def told(stage: str, done: int, total: int | None) -> None:
+            (progress or silent)(stage, done, total)
+
+        run, target = open_run(self.out), Path(path)
+        if isinstance(what, OverlayOptions):
+            return overlay(run, target, what, encode=encode, progress=told)
+        if isinstance(what, MoveOptions):
+            return move(run, target, what, encode=encode, progress=told)
+        return stabilise(run, target, what, encode=encode, progress=told)
 
     # ---- files
 

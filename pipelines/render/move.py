@@ -27,7 +27,7 @@ class MoveOptions:
     """path: CSV or JSON of keyframes (paths.read_move), angles in the shot's world. size_px: None = the clip's, with
     square pixels. fps: None = the clip's. shot: None = the only one with a panorama."""
 
-    path: Path
+    path: str | Path
     size_px: tuple[int, int] | None = None
     fps: float | None = None
     shot: int | None = None
@@ -45,7 +45,7 @@ def move(
 
     The clip itself is not needed.
     """
-    keys = read_move(options.path)
+    keys = read_move(Path(options.path))
     if not 0 < keys.duration_s <= MAX_SECONDS:
         cause = f"runs for {keys.duration_s:g} s, more than {MAX_SECONDS:g}"
         raise InputError(options.path, cause, "time_s is in seconds")

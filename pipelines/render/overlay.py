@@ -52,7 +52,7 @@ class OverlayOptions:
     or the only one, and the whole clip is written.
     """
 
-    picture: Path
+    picture: str | Path
     corners: ArrayLike
     space: CornerSpace = "frame"
     at: int | None = None
@@ -77,7 +77,7 @@ def overlay(
     the clip; OutputError: cannot be written."""
     index, views = _shot_and_views(run, options)
     rays = corner_rays(run, index, views, options)
-    levels = read_picture(options.picture)
+    levels = read_picture(Path(options.picture))
     try:
         inlay = place(levels, rays)
     except ValueError as error:

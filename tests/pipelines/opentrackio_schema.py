@@ -1,6 +1,9 @@
 """The parts of the OpenTrackIO 1.0.1 schema that our samples use, restated from the published one.
 
-The same keys, types, ranges and required members, and the same refusal of unknown keys.
+The same keys, types, ranges and required members, and the same refusal of unknown keys. No package registry has the
+published file. What could be read of the public camdkit repository is from before 1.0.1 and agrees but for two names
+(focalLength; the time code's frameRate, which stood within format). test_exports.py checks against the file itself
+where OPENTRACKIO_SCHEMA names one.
 """
 
 from __future__ import annotations

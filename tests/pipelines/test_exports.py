@@ -6,6 +6,7 @@ The tolerance is 0.01 px, or the format's own quantum where that is coarser; it 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import uuid
@@ -116,6 +117,19 @@ def test_opentrackio_samples_obey_the_schema(tmp_path: Path) -> None:
     # The check itself can fail: a wrong id, an unknown key.
     for spoiled in ({"sampleId": str(uuid.uuid4())}, {"lens": {"focal": 3}}):
         assert list(validator.iter_errors({**samples[0], **spoiled}))
+
+
+@pytest.mark.oracle
+@pytest.mark.skipif(
+    "OPENTRACKIO_SCHEMA" not in os.environ, reason="no OPENTRACKIO_SCHEMA: the published file"
+)
+def test_opentrackio_samples_obey_the_published_schema(tmp_path: Path) -> None:
+    schema = json.loads(Path(os.environ["OPENTRACKIO_SCHEMA"]).read_text(encoding="utf-8"))
+    [shot, *_] = write(tmp_path, "opentrackio", truth(), sensor_width_mm=9.59)
+    assert shot.path is not None
+    validator = jsonschema.validators.validator_for(schema)(schema)
+    for line in shot.path.read_text(encoding="utf-8").splitlines():
+        assert [error.message for error in validator.iter_errors(json.loads(line))] == []
 
 
 def test_nominal_millimetres_are_said_to_be(tmp_path: Path) -> None:

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines import cli
+from pipelines import cli, open_result
+from pipelines.clicks import Clicks, clicks_of, read_clicks
 from pipelines.errors import InputError
-from pipelines.pitch import Clicks, Pitch, fit_pitch, pitch_of, read_clicks
+from pipelines.pitch import Pitch, fit_pitch, pitch_of
 from pipelines.pitch_templates import TEMPLATES, football
 from pipelines.render.opened import open_run
 from pipelines.render.overlay import OverlayOptions, corner_rays
@@ -248,3 +249,23 @@ def test_templates_have_the_sizes_of_the_rules() -> None:
     court = TEMPLATES["basketball"]().points
     bend = np.subtract(court["right far three-point line bend"], (14 - 1.575, 0))
     assert np.hypot(*bend) == pytest.approx(6.75)
+
+
+def test_clicks_may_be_rows_of_python(pan_run: Finished, clicks: Path, found: Pitch) -> None:
+    named = [(r["frame"], r["x_px"], r["y_px"], r["point"]) for r in click_rows(pan_run, 0.5)]
+    metric = [(*row[:3], *football().points[row[3]]) for row in named]
+    result = open_result(pan_run.out)
+    for given, template in ((named, "football"), (metric, None), (str(clicks), football())):
+        other = result.pitch(given, template=template, click_std_px=0.5)  # type: ignore[arg-type]
+        np.testing.assert_allclose(other.camera.position_m, found.camera.position_m, atol=1e-6)
+    for rows, template, said in (
+        ([(1, 2.0, 3.0)], None, "a row has 3 values"),
+        ([(1, 2.0, "here", 3.0, 4.0)], None, "no number"),
+        ([(1, 2.0, 3.0, "corner flag")], "football", "no point is called 'corner flag'"),
+        ([(1, 2.0, 3.0, "centre spot")], None, "no template was chosen"),
+        ([], None, "has no rows"),
+    ):
+        with pytest.raises(InputError, match=said):
+            clicks_of(rows, None if template is None else football())
+    with pytest.raises(ValueError, match="football, basketball, american-football"):
+        result.pitch(named, template="curling")

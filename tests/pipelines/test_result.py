@@ -18,6 +18,7 @@ from pipelines.errors import ConfigError, InputError, MissingToolError
 from tests.pipelines.end_to_end import Finished
 from tests.pipelines.export_truth import FIRST, LOST, N, truth
 from tests.pipelines.test_export_command import finished
+from tests.pipelines.test_pitch import POSITION, click_rows, write_rows
 
 GUIDE = Path(__file__).parents[2] / "docs" / "python-api.md"
 NAMES = [name for name, _, _ in COLUMNS]
@@ -119,6 +120,7 @@ def test_the_guides_examples_run_as_written(
     monkeypatch.chdir(tmp_path)
     shutil.copy(pan_run.clip, "match.mp4")
     shutil.copytree(pan_run.out, "match")
+    write_rows(Path("clicks.csv"), click_rows(pan_run))
     import pipelines.run
 
     real, asked = pipelines.run.process, []
@@ -146,6 +148,12 @@ def test_the_guides_examples_run_as_written(
     )
     assert (names["pairs"]["H_dst_src"].shape[1:], names["K"].shape) == ((3, 3), (50, 3, 3))
     assert Path("match/shot-000/camera.usda").is_file()
+    np.testing.assert_allclose(names["pitch"].camera.position_m, POSITION, atol=3)
+    np.testing.assert_allclose(
+        names["again_there"].camera.position_m, names["pitch"].camera.position_m, atol=0.5
+    )
+    assert names["done"].path == Path("board.mov") and names["done"].n_changed > 20
+    assert "50 of 50 frames are new" in said
 
 
 def test_results_cannot_be_changed_by_accident(result: Result) -> None:
