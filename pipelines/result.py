@@ -241,10 +241,11 @@ class Result:
         """The shot's panorama.tif with its surface. Raises InputError: no such shot, or it has no panorama."""
         import tifffile
 
+        from mosaic.framestore import eight_bits
         from pipelines.exports.panorama_json import read_surface
 
         path = self._file(shot, "panorama.tif")
-        picture = tifffile.imread(path)
+        picture = eight_bits(tifffile.imread(path))
         surface = read_surface(path.with_name("panorama.json"))
         return PanoramaPicture(image=picture[..., :3], alpha=picture[..., 3], surface=surface)
 
