@@ -19,7 +19,7 @@ from calib.gates import GateOptions
 from calib.records import Solution, Verdict
 from mosaic.coords import transfer
 from mosaic.records import PairFit
-from pipelines.bridge import CameraPlacement
+from pipelines.bridge import CameraPlacement, CameraPose
 from pipelines.keyframe_graph import KeyframeResult
 
 REASON = "not_a_rotation"
@@ -32,8 +32,8 @@ SENTENCE = "No camera that only turns and zooms explains the pictures: people fi
 MISFIT_PX = 2.0
 # Where the keyframes are few, chi2_dof says less. Half of the gate's is enough if besides the cameras do not repeat the
 # measured steps: median px at W = 1280. Shots with a chi2_dof above 3 whose cameras were right, or lost where not
-# (crowds, 40 % players): .4 to 1.04; wrong ones: 1.3 to 7.
-DOUBT_SHARE, DOUBT_STEP_PX = 0.5, 1.4
+# (crowds, 40 % players): .3 to 1.04; wrong ones: 1.3 to 5.6.
+DOUBT_SHARE, DOUBT_STEP_PX = 0.5, 1.25
 # A measured step is contradicted by cameras that move the picture elsewhere by more than this share of the width. In
 # shots whose cameras are right 99 % of the steps stay below .013, in the refused real one half are off by 4 widths.
 STEP_WIDTHS = 0.05
@@ -101,13 +101,19 @@ def step_errors_px(track: Solution, steps: Iterable[PairFit]) -> NDArray[np.floa
     row = {int(f): i for i, f in enumerate(track.frames) if np.isfinite(track.log_f[i])}
     width, height = track.lens.size_px
     points = np.array([[x * width, y * height] for y in (0.25, 0.75) for x in (0.25, 0.75)])
+
+    def camera(row: int, frame: int) -> CameraPlacement:
+        # With the lens: where it is hardly known it may be extreme, and the cameras repeat the steps all the same.
+        pose = CameraPose(log_f=float(track.log_f[row]), R=track.R[row])
+        return CameraPlacement(frame=frame, size_px=(width, height), lens=track.lens, pose=pose)
+
     errors = []
     for fit in steps:
         a, b = row.get(fit.src), row.get(fit.dst)
         if a is None or b is None or not fit.usable:
             continue
-        K = track.lens.K(track.log_f[[a, b]])
-        placed = transfer(K[1] @ track.R[b] @ track.R[a].T @ np.linalg.inv(K[0]), points)
+        rays = camera(a, fit.src).pixel_to_ray(points)
+        placed = camera(b, fit.dst).ray_to_pixel(rays)
         error = float(np.median(np.linalg.norm(placed - transfer(fit.H_dst_src, points), axis=1)))
         errors.append(error if np.isfinite(error) else np.inf)
     return np.array(errors)
