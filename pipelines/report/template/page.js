@@ -209,9 +209,12 @@
     for (let k = 0; k < slots; k++) {
       // Half a slot early or late is near enough to stand here: keyframes do not come at even times.
       const from = axisFrom + k * step, frame = nearest(thumbFrames, from + step / 2);
-      if (frame < from - step / 2 || frame > from + 1.5 * step || pictures.some((p) => +p.dataset.frame === frame)) continue;
+      const own = frame >= from - step / 2 && frame <= from + 1.5 * step && !pictures.some((p) => +p.dataset.frame === frame);
       const picture = document.createElement("img");
-      picture.src = data.thumbnails[frame]; picture.alt = ""; picture.title = "frame " + frame; picture.dataset.frame = frame; picture.draggable = false;
+      picture.src = data.thumbnails[frame]; picture.alt = ""; picture.draggable = false;
+      // Where no picture was kept the nearest one stands in, faint: no hole, and no picture of another time in full.
+      if (own) { picture.title = "frame " + frame; picture.dataset.frame = frame; }
+      else { picture.title = "no picture kept here; the nearest is of frame " + frame; picture.className = "near"; }
       picture.style.left = LEFT + k * plotWidth / slots + "px"; picture.style.width = plotWidth / slots - 3 + "px";
       pictures.push(picture);
     }
@@ -219,7 +222,7 @@
     markFilm();
   }
   function markFilm() {
-    const pictures = [...film.children];
+    const pictures = [...film.children].filter((picture) => picture.dataset.frame);
     if (!pictures.length || selected < 0) return;
     const now = nearest(pictures.map((picture) => +picture.dataset.frame), data.frame[selected]);
     pictures.forEach((picture) => picture.classList.toggle("now", +picture.dataset.frame === now));
