@@ -27,6 +27,8 @@ from mosaic.views import CompositeOptions, Lattice, ViewPlan, lattice_of, plan_v
 
 __all__ = ["Canvas", "CompositeOptions", "FrameStore", "Panorama", "ViewPlan", "composite", "plan_views"]
 
+STRIP_ROWS = 1024  # of a picture that are looked at together
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Panorama:
@@ -111,7 +113,10 @@ def composite(
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     layers = paint(replace(scene, deep=store.deep), canvas, progress)
     alpha = canvas.zeros(layers.n_seen.shape)
-    np.multiply(layers.n_seen > 0, np.uint8(255), out=alpha, casting="unsafe")
+    for top in range(0, surface.height, STRIP_ROWS):  # not at once: both may be larger than memory
+        rows = np.s_[top : top + STRIP_ROWS]
+        np.multiply(layers.n_seen[rows] > 0, np.uint8(255), out=alpha[rows], casting="unsafe")
+        canvas.release()
     return Panorama(
         image=layers.image, alpha=alpha, surface=surface, n_seen=layers.n_seen, spread=layers.spread,
         frames=tuple(p.frame for p in views), placements=by_frame, gains=gains, deep=layers.deep, canvas=canvas,

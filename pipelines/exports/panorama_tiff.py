@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,11 @@ def write_panorama_tiff(
     while max(height, width) >> (n_levels - 1) > TILE_PX:
         n_levels += 1
     canvas = Canvas(scratch or tempfile.gettempdir(), memory_bytes)
+
+    def release() -> None:
+        panorama.release()
+        canvas.release()
+
     packet = gpano_xmp(panorama.surface) if panorama.surface.kind == "equirectangular" else None
     extra = [] if packet is None else [(700, "B", len(packet), packet, True)]
     picture: NDArray[Any] = panorama.image if panorama.deep is None else panorama.deep
@@ -55,9 +60,9 @@ def write_panorama_tiff(
         image, alpha = picture, panorama.alpha
         for level in range(n_levels):
             if level:
-                image, alpha = halve(image, alpha, canvas)
+                image, alpha = halve(image, alpha, canvas, release)
             writer.write(
-                _tiles(image, alpha),
+                _tiles(image, alpha, release),
                 shape=(*alpha.shape, 4), dtype=picture.dtype, photometric="rgb", extrasamples=["unassalpha"],
                 predictor=depth > 1,
                 tile=(TILE_PX, TILE_PX), compression="zlib", compressionargs={"level": compression_level},
@@ -65,13 +70,15 @@ def write_panorama_tiff(
                 extratags=extra if level == 0 else [], software="broadcast-mosaic", metadata=None,
                 iccprofile=srgb_profile() if level == 0 else None,
             )  # fmt: skip
-            panorama.release()
-            canvas.release()
+            release()
     return n_levels
 
 
-def _tiles(image: NDArray[Any], alpha: NDArray[np.uint8]) -> Iterator[NDArray[Any]]:
-    """RGBA tiles row by row, those at the border padded with transparent black; alpha full where the colour is."""
+def _tiles(
+    image: NDArray[Any], alpha: NDArray[np.uint8], release: Callable[[], None]
+) -> Iterator[NDArray[Any]]:
+    """RGBA tiles row by row, those at the border padded with transparent black; alpha full where the colour is.
+    release: called after each row of tiles, which is not needed again soon."""
     full = np.iinfo(image.dtype).max // 255
     height, width = alpha.shape
     for y in range(0, height, TILE_PX):
@@ -81,12 +88,14 @@ def _tiles(image: NDArray[Any], alpha: NDArray[np.uint8]) -> Iterator[NDArray[An
             tile[: part.shape[0], : part.shape[1], :3] = image[y : y + TILE_PX, x : x + TILE_PX]
             tile[: part.shape[0], : part.shape[1], 3] = part.astype(image.dtype) * full
             yield tile
+        release()
 
 
 def halve(
-    image: NDArray[Any], alpha: NDArray[np.uint8], canvas: Canvas
+    image: NDArray[Any], alpha: NDArray[np.uint8], canvas: Canvas, release: Callable[[], None] | None = None
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """Means over 2 x 2 px, colours weighted by alpha; an odd last row or column stands for two."""
+    """Means over 2 x 2 px, colours weighted by alpha; an odd last row or column stands for two. release: called now
+    and then."""
     height, width = alpha.shape
     small = ((height + 1) // 2, (width + 1) // 2)
     half_image, half_alpha = canvas.zeros((*small, 3), image.dtype.type), canvas.zeros(small)
@@ -103,4 +112,6 @@ def halve(
         divisor = np.maximum(total, 1)[..., None]
         half_image[target] = (colour + divisor // 2) // divisor
         half_alpha[target] = (total + 2) // 4
+        if release is not None and row % (4 * step) == 0:
+            release()
     return half_image, half_alpha
