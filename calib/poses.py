@@ -26,12 +26,14 @@ MAX_BAND = 12  # frames: links between free frames that reach further get their 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseOptions:
-    """How solve_poses() works: huber in sigmas times the robust scale; bad_edge as in RefineOptions."""
+    """How solve_poses() works: huber in sigmas times the robust scale; bad_edge as in RefineOptions. error_bars: off
+    leaves the sigmas of the solved frames NaN, for a third of the time less."""
 
     huber: float = 3.0
     bad_edge: float = 6.0
     max_steps: int = 30
     tolerance: float = 1e-6
+    error_bars: bool = True
 
 
 class _PoseSystem:
@@ -126,10 +128,18 @@ def _iterate(
     return state, cost, converged, step_count, system.matrix(diagonal, coupling)
 
 
-def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions | None = None) -> Solution:
+def solve_poses(
+    graph: HomographyGraph,
+    held: Solution,
+    *,
+    options: PoseOptions | None = None,
+    start: Solution | None = None,
+) -> Solution:
     """Cameras of all frames of `graph`: those in `held` as they are there, the others solved against them.
 
-    graph: frames and edges; edges may join free frames. held: keyframes, lens and their error bars.
+    graph: frames and edges; edges may join free frames. held: keyframes, lens and their error bars. start: an earlier
+    solution of these frames in the same world axes to begin from; without it, or for frames that it lacks, they are
+    chained on from the held ones.
     Returns a Solution over graph.frames. sigma_log_f is the own error of the pose combined with the held frames' error
     (interpolated in frame number); sigma_log_zoom likewise. Frames without a path to a held frame are NaN rows.
     Raises ValueError when none of the graph's frames is held.
@@ -143,7 +153,7 @@ def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions 
     useful = everything.dof.sum(1) >= 6
     packed = everything.select(useful)
     reference = int(np.flatnonzero(is_held)[0])
-    state = _initial(packed, graph, held, reference)
+    state = _initial(packed, graph, held, reference, start)
     free = ~is_held
     reach = linked_to(packed, np.ones(packed.n_edges, bool), is_held)
     free &= reach
@@ -169,16 +179,26 @@ def solve_poses(graph: HomographyGraph, held: Solution, *, options: PoseOptions 
             break
         ok, free = now, ~is_held & reach
     return _summarise(
-        graph, held, packed, useful, state, is_held, free, ok, system, matrix, loss, cost, converged, n_steps
-    )
+        graph, held, packed, useful, state, is_held, free, ok, system, matrix if options.error_bars else None, loss,
+        cost, converged, n_steps,
+    )  # fmt: skip
 
 
-def _initial(packed: Packed, graph: HomographyGraph, held: Solution, reference: int) -> State:
-    """State with the held cameras in their own gauge (reference of `held`), the others chained."""
-    state = state_from_solution(packed, graph.frames, held, reference)
+def _initial(
+    packed: Packed, graph: HomographyGraph, held: Solution, reference: int, start: Solution | None
+) -> State:
+    """State with the held cameras in their own gauge (reference of `held`), the others from `start` or chained."""
+    first = int(graph.frames[reference])
+    known = start is not None and first in start.frames and np.isfinite(start.log_f[start.index(first)])
+    source = replace(start, lens=held.lens) if start is not None and known else held
+    state = state_from_solution(packed, graph.frames, source, reference)
     # state_from_solution puts the reference row at I; go back to the held world axes.
-    back = held.R[held.index(int(graph.frames[reference]))]
-    return State(state.log_f, state.R @ back, state.shared)
+    log_f, R = state.log_f, state.R @ source.R[source.index(first)]
+    rows = {frame: k for k, frame in enumerate(held.frames.tolist()) if np.isfinite(held.log_f[k])}
+    for k, frame in enumerate(graph.frames.tolist()):
+        if frame in rows:
+            log_f[0, k], R[0, k] = held.log_f[rows[frame]], held.R[rows[frame]]
+    return State(log_f, R, state.shared)
 
 
 def _summarise(

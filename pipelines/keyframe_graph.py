@@ -9,7 +9,9 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
@@ -79,12 +81,13 @@ class KeyframeImages:
 class KeyframeOptions:
     """max_rounds of registering and refining; settled: change of mean log f at which they stop. max_distance: widths
     between two centres up to which keyframes are paired (1 - overlap). torn_share: unlinked keyframes beyond which the
-    full model is given up for a plain one."""
+    full model is given up for a plain one. threads: that register."""
 
     max_rounds: int = 8
     settled: float = 0.001
     max_distance: float = 0.8
     torn_share: float = 0.34
+    threads: int = 1
     register: RegisterOptions = field(default_factory=RegisterOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
 
@@ -137,16 +140,20 @@ def refine_keyframes(
     mask: NDArray[np.bool_] | None,
     priors: Priors,
     options: KeyframeOptions,
+    running: Solution | None = None,
 ) -> KeyframeResult:
     """Refine from the first pass' edges, then alternate registration and refinement (at most max_rounds).
 
-    templates: keyframes by frame number. first_fits: what pass one measured among them. Never raises on bad data: the
-    solution says that it did not converge.
+    templates: keyframes by frame number. first_fits: what pass one measured among them. running: the first pass' own
+    solution where it can be trusted; it only has to bring the pairs within reach of the first round, which looks for
+    the optimum from scratch. Never raises on bad data: the solution says that it did not converge.
     """
     frames = sorted(templates)
     graph = homography_graph(frames, first_fits, size_px)
     refine_options = replace(options.refine, reference=_best_linked(graph))
-    solution = refine(graph, priors=priors, options=refine_options)
+    solution = refine(graph, start=running, priors=priors, options=refine_options)
+    if running is not None and not (solution.converged and np.isfinite(solution.log_f).all()):
+        solution = refine(graph, priors=priors, options=refine_options)
     fits = tuple(f for f in first_fits if f.src in templates and f.dst in templates)
     rounds = 0
     for rounds in range(1, options.max_rounds + 1):
@@ -238,18 +245,18 @@ def register_pairs(
     for frame, pose in poses.items():
         family = RotationZoomFamily(lens=solution.lens, log_f_src=pose.log_f)
         prepared[frame] = prepare(templates[frame], rolling.family(family, frame) if rolling else family)
-    fits = []
-    for b in sorted(poses):
+
+    def register(b: int) -> list[PairFit]:
         near = sorted((distance_in_widths(poses[a], poses[b], width), a) for a in poses if a < b)
         near = [(d, a) for d, a in near if d <= options.max_distance]
         if len(near) > NEAREST + FARTHEST:
             near = near[:NEAREST] + near[-FARTHEST:]
         if not near:
-            continue
+            return []
         target = images.pyramid(b, n_levels, mask)
         levels = (2, 1, 0) if len(target.levels) > 2 else None
-        for _, a in near:
-            fit, _ = align(
+        return [
+            align(
                 rolling.seen(prepared[a], b) if rolling else prepared[a],
                 target,
                 pair_state(poses[a], poses[b]),
@@ -257,6 +264,9 @@ def register_pairs(
                 levels=levels,
                 options=options.register,
                 route="keyframe pair",
-            )
-            fits.append(fit)
-    return fits
+            )[0]
+            for _, a in near
+        ]
+
+    with ThreadPoolExecutor(options.threads) as workers:
+        return list(chain.from_iterable(workers.map(register, sorted(poses))))

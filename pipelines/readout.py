@@ -35,17 +35,17 @@ def with_readout(
     result: KeyframeResult,
     fits: Sequence[PairFit],
     register: Callable[[Solution, Rolling | None], list[PairFit]],
-    poses: Callable[[KeyframeResult], Solution],
+    poses: Callable[[KeyframeResult, Solution | None], Solution],
 ) -> KeyframeResult:
     """The keyframes without the effect of a rolling shutter where the shot shows one; `readout` says what was found.
 
     fits: of frames to keyframes. register: the keyframe pairs anew, through a solution's lens and a rolling shutter.
-    poses: every frame's camera, by keyframes.
+    poses: every frame's camera, by keyframes and from an earlier track.
     """
     solution = result.solution
     if not (result.options.distortion and np.isfinite(solution.log_f).sum() >= 2):
         return result
-    track = poses(result)
+    track = poses(result, None)
     found = _look(result, fits, track)
     plain = replace(result, readout=found)
     best = plain
@@ -74,7 +74,7 @@ def with_readout(
         best = replace(best, solution=refined, graph=mended, fits=tuple(pairs), readout=found)
         if settled:
             break
-        track = poses(best)
+        track = poses(best, track)
     return best
 
 

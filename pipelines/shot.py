@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.gates import GateOptions, judge
 from calib.level import level
 from calib.parallax import Parallax
-from calib.poses import solve_poses
+from calib.poses import PoseOptions, solve_poses
 from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
 from mosaic.composite import Panorama, composite
@@ -129,9 +129,11 @@ def solve_shot(
     priors, refine_options = tracker.priors, refine_options_of(config)
     with timings.measure("keyframes"):
         templates = {k: key.template for k, key in tracker.keyframes.items()}
-        options_k = KeyframeOptions(refine=refine_options, register=tracker.register_options)
+        options_k = KeyframeOptions(
+            refine=refine_options, register=tracker.register_options, threads=config.run.threads or 2
+        )
 
-        def refined(chosen: Iterable[int]) -> KeyframeResult:
+        def refined(chosen: Iterable[int], running: Solution | None) -> KeyframeResult:
             own = {k: templates[k] for k in chosen}
             return refine_keyframes(
                 own,
@@ -142,9 +144,10 @@ def solve_shot(
                 mask=mask,
                 priors=priors,
                 options=options_k,
+                running=running,
             )
 
-        result = refined(templates)
+        result = refined(templates, tracker.calibrator.solution if tracker.trusts_camera else None)
         alone = part_to_solve_alone(
             [o.frame for o in tracker.observations if o.status == "ok"],
             templates,
@@ -152,16 +155,18 @@ def solve_shot(
             result.solution.reference,
         )
         if alone is not None:
-            result = refined(sorted(alone))
+            result = refined(sorted(alone), None)
         result = _with_central_reference(result, priors)
 
         def register(solved: Solution, rolling: Rolling | None = None) -> list[PairFit]:
             return register_pairs(templates, images, solved, n_levels, mask, options_k, rolling)
 
         result = with_pupil(result, register)
-        result = with_readout(
-            result, tracker.fits, register, lambda found: frame_poses(tracker, found, tracker.fits)
-        )
+
+        def poses(found: KeyframeResult, start: Solution | None) -> Solution:
+            return frame_poses(tracker, found, tracker.fits, start=start, error_bars=False)
+
+        result = with_readout(result, tracker.fits, register, poses)
         result = _with_known_focal(result, tracker, config, priors)
         shift = result.pupil.shift_log_f if result.pupil is not None else 0.0
         verdict = judge(
@@ -181,7 +186,7 @@ def solve_shot(
 
     steps = frame_steps(tracker)
     with timings.measure("poses"):
-        approximate = frame_poses(tracker, result, tracker.fits)
+        approximate = frame_poses(tracker, result, tracker.fits, error_bars=not config.panorama.enabled)
         explained = rotation_fit(result, approximate, steps)
     if explained.refused:
         return refused(approximate, explained, tracker.fits)
@@ -191,6 +196,8 @@ def solve_shot(
     torn = len(placeable) < LEAST_PIECE * np.isfinite(approximate.log_f).sum()
     usable = config.panorama.enabled and placeable and not torn
     if not usable:
+        if config.panorama.enabled:
+            approximate = frame_poses(tracker, result, tracker.fits, start=approximate)
         keyed = [f for f in tracker.fits if f.src in tracker.keyframes]
         approximate, doubtful = without_doubtful(approximate, [*result.fits, *keyed])
         rows = shot_rows(
@@ -229,7 +236,7 @@ def solve_shot(
                 threads=config.run.threads or 2, progress=progress,
             )  # fmt: skip
         with timings.measure("poses"):
-            solution = frame_poses(tracker, result, [*fits, *steps])
+            solution = frame_poses(tracker, result, [*fits, *steps], start=approximate)
             explained = rotation_fit(result, solution, steps)
             if explained.refused:
                 return refused(solution, explained, fits)
@@ -397,17 +404,33 @@ def _with_known_focal(
     return replace(result, solution=refined) if np.isfinite(refined.log_f).any() else result
 
 
-def frame_poses(tracker: ShotTracker, result: KeyframeResult, fits: Sequence[PairFit]) -> Solution:
-    """Every frame against the held keyframes. A shot of one keyframe keeps its prior focal and is never claimed."""
+def frame_poses(
+    tracker: ShotTracker,
+    result: KeyframeResult,
+    fits: Sequence[PairFit],
+    *,
+    start: Solution | None = None,
+    error_bars: bool = True,
+) -> Solution:
+    """Every frame against the held keyframes. A shot of one keyframe keeps its prior focal and is never claimed.
+
+    start: an earlier track of the shot in the same axes, to begin from. error_bars: see calib.poses.PoseOptions.
+    """
     held = result.solution
     frames = [o.frame for o in tracker.observations if o.status != "lost" and o.reason != "duplicate"]
     if not np.isfinite(held.log_f).any():
         held = _prior_only(held, tracker)
     between = [f for f in fits if not (f.src in tracker.keyframes and f.dst in tracker.keyframes)]
     graph = homography_graph(frames, between, tracker.size_px)
-    solved = solve_poses(graph, held)
-    if result.parallax is not None or (result.readout is not None and result.readout.found):
-        solved = solve_poses(without_readout(graph, solved, result), held)
+    moved = result.parallax is not None or (result.readout is not None and result.readout.found)
+    solved = solve_poses(graph, held, options=PoseOptions(error_bars=error_bars and not moved), start=start)
+    if moved:
+        solved = solve_poses(
+            without_readout(graph, solved, result),
+            held,
+            options=PoseOptions(error_bars=error_bars),
+            start=solved,
+        )
     return _with_duplicates(solved, tracker)
 
 
