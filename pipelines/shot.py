@@ -163,11 +163,17 @@ def solve_shot(
 
         result = with_pupil(result, register)
 
+        track: Solution | None = None
+
         def poses(found: KeyframeResult, start: Solution | None) -> Solution:
-            return frame_poses(tracker, found, tracker.fits, start=start, error_bars=False)
+            nonlocal track
+            track = frame_poses(tracker, found, tracker.fits, start=start, error_bars=False)
+            return track
 
         result = with_readout(result, tracker.fits, register, poses)
-        result = _with_known_focal(result, tracker, config, priors)
+        scaled = _with_known_focal(result, tracker, config, priors)
+        if scaled is not result:  # other focals, other turns
+            result, track = scaled, None
         shift = result.pupil.shift_log_f if result.pupil is not None else 0.0
         verdict = judge(
             result.solution, result.graph, GateOptions(refine=result.options), pupil_shift_log_f=shift
@@ -186,7 +192,9 @@ def solve_shot(
 
     steps = frame_steps(tracker)
     with timings.measure("poses"):
-        approximate = frame_poses(tracker, result, tracker.fits, error_bars=not config.panorama.enabled)
+        approximate = frame_poses(
+            tracker, result, tracker.fits, start=track, error_bars=not config.panorama.enabled
+        )
         explained = rotation_fit(result, approximate, steps)
     if explained.refused:
         return refused(approximate, explained, tracker.fits)
@@ -422,15 +430,12 @@ def frame_poses(
         held = _prior_only(held, tracker)
     between = [f for f in fits if not (f.src in tracker.keyframes and f.dst in tracker.keyframes)]
     graph = homography_graph(frames, between, tracker.size_px)
-    moved = result.parallax is not None or (result.readout is not None and result.readout.found)
-    solved = solve_poses(graph, held, options=PoseOptions(error_bars=error_bars and not moved), start=start)
-    if moved:
-        solved = solve_poses(
-            without_readout(graph, solved, result),
-            held,
-            options=PoseOptions(error_bars=error_bars),
-            start=solved,
-        )
+    bars = PoseOptions(error_bars=error_bars)
+    if result.parallax is None and not (result.readout is not None and result.readout.found):
+        return _with_duplicates(solve_poses(graph, held, options=bars, start=start), tracker)
+    # What pupil and shutter did to a pair wants cameras only roughly: those of an earlier track will do.
+    rough = start if start is not None else solve_poses(graph, held, options=PoseOptions(error_bars=False))
+    solved = solve_poses(without_readout(graph, rough, result), held, options=bars, start=rough)
     return _with_duplicates(solved, tracker)
 
 
