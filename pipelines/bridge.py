@@ -323,6 +323,8 @@ class CameraPlacement:
     """A solved camera as the compositor sees it: rays of the shot world to raw pixels and back (mosaic's Placement).
 
     parallax, in the axes of the rays: of a pupil in front of the pan axis. Rays are those of the pan axis then.
+    share, rate (4,): of a rolling shutter, time from the first row to the last over that between frames, and change of
+    log f and left rotation vector a frame; pose is the middle row's camera.
     """
 
     frame: int
@@ -331,6 +333,8 @@ class CameraPlacement:
     pose: CameraPose
     blur_px: float = 0.0
     parallax: Parallax | None = None
+    share: float = 0.0
+    rate: FloatArray | None = None
 
     @property
     def px_per_rad(self) -> float:
@@ -343,16 +347,43 @@ class CameraPlacement:
         if self.parallax is not None:
             directions = self.parallax.from_pupil(directions, self.pose.R[2])
         axes = directions @ self.pose.R.T
-        f = np.exp(self.pose.log_f)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            q = np.where(axes[..., 2:] > 1e-6, axes[..., :2] / axes[..., 2:], np.nan)
-        ideal = self.lens.pp_px + q * np.array([f, f / self.lens.aspect])
-        return self.lens.distort(ideal, self.pose.log_f)
+        at = self._project(axes, np.exp(self.pose.log_f))
+        if self.rate is None:
+            return at
+        # Where a point moves to within half the read-out, taken for a straight line: then which row meets it is known.
+        span = self.share / 2
+        turned = axes @ rotation.exp(self.rate[1:] * span).T
+        velocity = (self._project(turned, np.exp(self.pose.log_f + self.rate[0] * span)) - at) / span
+        late = self._late(at[..., 1]) / (1 - self.share * velocity[..., 1] / self.size_px[1])
+        return np.asarray(at + velocity * late[..., None])
 
     def pixel_to_ray(self, xy: ArrayLike) -> FloatArray:
         """Raw px (..., 2) to unit world rays (..., 3)."""
         f = np.exp(self.pose.log_f)
         d = (self.lens.undistort(xy, self.pose.log_f) - self.lens.pp_px) / np.array([f, f / self.lens.aspect])
         ray = np.concatenate([d, np.ones((*d.shape[:-1], 1))], axis=-1)
+        if self.rate is not None:
+            late = self._late(np.asarray(xy, np.float64)[..., 1])
+            ray[..., :2] *= np.exp(-self.rate[0] * late)[..., None]
+            ray = _turned_by(ray, -self.rate[1:] * late[..., None])
         directions = (ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ self.pose.R
         return directions if self.parallax is None else self.parallax.from_axis(directions, self.pose.R[2])
+
+    def _project(self, axes: FloatArray, f: float) -> FloatArray:
+        """Camera axes (..., 3) at focal f to raw px."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            q = np.where(axes[..., 2:] > 1e-6, axes[..., :2] / axes[..., 2:], np.nan)
+        return self.lens.distort(self.lens.pp_px + q * np.array([f, f / self.lens.aspect]), self.pose.log_f)
+
+    def _late(self, y_px: FloatArray) -> FloatArray:
+        """By how much of a frame's time (...) the row at y_px was read after the middle one; half a picture beyond the
+        first and last row at most."""
+        where = (np.nan_to_num(y_px) + 0.5) / self.size_px[1] - 0.5
+        return np.asarray(self.share * np.clip(where, -1.0, 1.0))
+
+
+def _turned_by(vectors: FloatArray, turn: FloatArray) -> FloatArray:
+    """exp(turn) vectors, both (..., 3), for turns of a few hundredths rad: to the third order."""
+    once = np.cross(turn, vectors)
+    twice = np.cross(turn, once)
+    return np.asarray(vectors + once + twice / 2 + np.cross(turn, twice) / 6)

@@ -87,7 +87,7 @@ def _member(group: Group, kept: KeptShot) -> _Member:
     )  # fmt: skip
     fitting = replace(solution, log_f=np.where(contradicted_frames(solution), np.nan, solution.log_f))
     world = group.level.R_head_world if group.level.observable else np.eye(3)
-    placements = placements_of(fitting, world, kept.observations, kept.size_px, result.parallax)
+    placements = placements_of(fitting, world, kept.observations, kept.size_px, result)
     calibrated = replace(
         kept.solved, solution=solution, verdict=group.verdict, level=group.level, keyframes=result, rows=rows
     )

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from calib.gates import GateOptions, judge
 from calib.level import level
-from calib.parallax import Parallax
 from calib.poses import PoseOptions, solve_poses
 from calib.records import KnownFocal, Level, Priors, Solution, Verdict
 from calib.refine import RefineOptions, refine
@@ -199,7 +198,7 @@ def solve_shot(
     if explained.refused:
         return refused(approximate, explained, tracker.fits)
     # Where frames lie relative to each other: the axes of the reference will do.
-    placed = placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px, result.parallax)
+    placed = placements_of(approximate, np.eye(3), tracker.observations, tracker.size_px, result)
     placeable = largest_piece(placed)
     torn = len(placeable) < LEAST_PIECE * np.isfinite(approximate.log_f).sum()
     usable = config.panorama.enabled and placeable and not torn
@@ -224,7 +223,7 @@ def solve_shot(
     world = head.R_head_world if head.observable else np.eye(3)
     options = CompositeOptions(views=config.panorama.views)
     with timings.measure("plan"):
-        placements = placements_of(approximate, world, tracker.observations, tracker.size_px, result.parallax)
+        placements = placements_of(approximate, world, tracker.observations, tracker.size_px, result)
         surface, plan = _plan([p for p in placements if p.frame in placeable], config, options)
     store = FrameStore(scratch, tracker.size_px)
     kept = False
@@ -251,7 +250,7 @@ def solve_shot(
             solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
         with timings.measure("composite"):
             fitting = replace(solution, log_f=np.where(contradicted_frames(solution), np.nan, solution.log_f))
-            placements = placements_of(fitting, world, tracker.observations, tracker.size_px, result.parallax)
+            placements = placements_of(fitting, world, tracker.observations, tracker.size_px, result)
             together = largest_piece(placements)
             placements = [p for p in placements if p.frame in together]
             panorama, players = None, None
@@ -333,14 +332,18 @@ def placements_of(
     R_surface_world: NDArray[np.float64],
     observations: Sequence[Observation],
     size_px: tuple[int, int],
-    parallax: Parallax | None = None,
+    keyframes: KeyframeResult,
 ) -> list[CameraPlacement]:
     """Placements of all solved frames, in the panorama's axes; half a frame's motion counts as blur.
 
-    parallax: of the pupil, in world axes.
+    keyframes: the pupil and the rolling shutter that were found with them belong to every frame.
     """
+    parallax = keyframes.parallax
     turned = None if parallax is None else parallax.of_axes(R_surface_world)
     motion = {o.frame: o.motion_px for o in observations}
+    found = keyframes.readout
+    rolling = rolling_of(found.share, solution) if found is not None and found.found else None
+    rates = {} if rolling is None else rolling.rates
     return [
         CameraPlacement(
             frame=int(frame),
@@ -349,6 +352,8 @@ def placements_of(
             pose=CameraPose(log_f=float(log_f), R=R @ R_surface_world.T),
             blur_px=float(np.nan_to_num(motion.get(int(frame), 0.0), nan=0.0)) * 0.5,
             parallax=turned,
+            share=0.0 if rolling is None else rolling.share,
+            rate=rates.get(int(frame)),
         )
         for frame, log_f, R in zip(solution.frames, solution.log_f, solution.R, strict=True)
         if np.isfinite(log_f) and int(frame) in motion

@@ -1,5 +1,7 @@
 """The rotation + zoom family: points against calib's camera, Jacobian and A against central differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -41,6 +43,28 @@ def test_a_placement_with_parallax_sees_near_and_far_apart_and_is_its_own_invers
     spread = np.linalg.norm(moved.ray_to_pixel(plain.pixel_to_ray(POINTS)) - POINTS, axis=1)
     near = POINTS[:, 1] > 1000
     assert spread[near].min() > 1.0 and spread[near].mean() > 1.5 * spread[POINTS[:, 1] < 300].mean()
+
+
+def test_a_placement_of_a_rolling_shutter_has_a_camera_a_row_and_is_its_own_inverse():
+    lens, src, _, _, _ = family_and_state(c1=0.0)
+    rate = np.array([0.01, 0.002, 0.03, 0.001])  # a fast pan: 75 px a frame
+    rolling = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=src, share=0.6, rate=rate)
+    rays = rolling.pixel_to_ray(POINTS)
+    # Up to 25 px away, and an arc is taken for a line; a tenth of the speed leaves a hundredth of that.
+    np.testing.assert_allclose(rolling.ray_to_pixel(rays), POINTS, atol=0.5)
+    slow = replace(rolling, rate=rate / 10)
+    np.testing.assert_allclose(slow.ray_to_pixel(slow.pixel_to_ray(POINTS)), POINTS, atol=6e-3)
+    # Each row by itself: the camera as it stood when that row was read.
+    for point, ray in zip(POINTS[:20], rays[:20], strict=True):
+        late = 0.6 * ((point[1] + 0.5) / SIZE[1] - 0.5)
+        pose = CameraPose(log_f=src.log_f + rate[0] * late, R=rotation.exp(rate[1:] * late) @ src.R)
+        of_row = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=pose)
+        np.testing.assert_allclose(of_row.ray_to_pixel(ray), point, atol=1e-3)
+    middle = np.array([[100.0, (SIZE[1] - 1) / 2], [1800.0, (SIZE[1] - 1) / 2]])
+    plain = CameraPlacement(frame=0, size_px=SIZE, lens=lens, pose=src)
+    np.testing.assert_allclose(rolling.pixel_to_ray(middle), plain.pixel_to_ray(middle), atol=1e-12)
+    corner = np.array([[0.0, 0.0]])
+    assert np.linalg.norm(plain.ray_to_pixel(rolling.pixel_to_ray(corner)) - corner) > 15
 
 
 @pytest.mark.parametrize("parameter", range(4))
