@@ -121,8 +121,11 @@ def main() -> None:
             for seed in arguments.seeds:
                 path = path_of(photograph, seed, (width, height), arguments.frames)
                 clip = folder / f"{place.rpartition('/')[2]}-{seed}-{size_name}.mp4"
-                if not truth_path(clip).exists():
-                    write_photo_clip(clip, photograph, people, path, arguments.people)
+                if not clip.exists():  # one that was broken off has another name
+                    unfinished = clip.with_name(f"unfinished-{clip.name}")
+                    write_photo_clip(unfinished, photograph, people, path, arguments.people)
+                    truth_path(unfinished).replace(truth_path(clip))
+                    unfinished.replace(clip)
                 run = folder / f"run-{clip.stem}"
                 process(clip, run, config)
                 shots = compare_run(run, truth_path(clip))["shots"]
