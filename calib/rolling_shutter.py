@@ -60,7 +60,8 @@ def rolling_shutter(graph: HomographyGraph, solution: Solution, rates: Array | N
     scale: Array | None = None
     for part in chunks(packed.n_edges, 1, packed.dof.shape[1]):
         r, J, g, speed = _displacement(packed, solution, rates, part)
-        fastest = max(fastest, float(np.nanmax(np.nanmedian(speed, axis=1), initial=0)))
+        seen = np.isfinite(speed).any(axis=1)
+        fastest = max(fastest, float(np.nanmedian(speed[seen], axis=1).max(initial=0)))
         s11, s12, s22 = packed.s11[part], packed.s12[part], packed.s22[part]
         S = np.stack([np.stack([s11, s12], 1), np.stack([s12, s22], 1)], 1)  # (E, 2, 2, m)
         usable = (
