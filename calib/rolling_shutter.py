@@ -142,6 +142,11 @@ def without_rolling_shutter(
     return replace(graph, edges=tuple(edges))
 
 
+def row_delay(y_px: Array, height_px: int) -> Array:
+    """When the row at y_px (...) is read after the middle one, over the time from the first row to the last."""
+    return np.asarray((y_px + 0.5) / height_px - 0.5)
+
+
 def frame_rates(solution: Solution) -> Array:
     """`motion_rates` of a solution's frames."""
     return motion_rates(solution.frames, solution.log_f, solution.R)
@@ -186,7 +191,7 @@ def _displacement(
     with np.errstate(all="ignore"):
         rx, ry, J = residuals(packed, state, part, jacobian=True, pose_only=True)
     J = J[0]
-    late_a, late_b = (((y[part] + 0.5) / packed.size_px[1] - 0.5)[:, None] for y in (packed.a_y, packed.b_y))
+    late_a, late_b = (row_delay(y[part], packed.size_px[1])[:, None] for y in (packed.a_y, packed.b_y))
     # T' v_a = -J_a rate_a: a point of the scene stays where it is in b while a turns.
     by_a = np.einsum("ek,ekim->eim", rates[packed.ia[part]], J[:, 0:4])
     by_b = np.einsum("ek,ekim->eim", rates[packed.ib[part]], J[:, 4:8])

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib import rotation
 from calib.parallax import Parallax
 from calib.records import HomographyEdge, HomographyGraph, Lens, Solution
-from calib.rolling_shutter import frame_rates
+from calib.rolling_shutter import frame_rates, row_delay
 from mosaic.records import PairFit
 from mosaic.template import PreparedTemplate
 
@@ -257,7 +257,7 @@ class RollingFamily:
         return self.base.update(state, step)
 
     def _moved(self, at_px: FloatArray, J: NDArray[np.float32], rate: FloatArray) -> FloatArray:
-        late = self.share * ((at_px[:, 1:] + 0.5) / self.base.lens.size_px[1] - 0.5)
+        late = self.share * row_delay(at_px[:, 1:], self.base.lens.size_px[1])
         return np.asarray((J @ rate) * late, np.float64)
 
 
@@ -281,8 +281,10 @@ class Rolling:
         return RollingFamily(base=base, share=self.share, rate_src=rate, rate_dst=np.zeros(4))
 
 
-def rolling_of(share: float, track: Solution) -> Rolling:
-    """For registration, from the cameras of all frames."""
+def rolling_of(share: float | None, track: Solution) -> Rolling | None:
+    """For registration, from the cameras of all frames; None for a shot without a rolling shutter (share None)."""
+    if share is None:
+        return None
     rates = frame_rates(track)
     known = np.isfinite(rates).all(axis=1)
     return Rolling(share=share, rates=dict(zip(track.frames[known].tolist(), rates[known], strict=True)))
@@ -352,8 +354,8 @@ class CameraPlacement:
             return at
         # Where a point moves to within half the read-out, taken for a straight line: then which row meets it is known.
         span = self.share / 2
-        turned = axes @ rotation.exp(self.rate[1:] * span).T
-        velocity = (self._project(turned, np.exp(self.pose.log_f + self.rate[0] * span)) - at) / span
+        later = axes @ rotation.exp(self.rate[1:] * span).T
+        velocity = (self._project(later, np.exp(self.pose.log_f + self.rate[0] * span)) - at) / span
         late = self._late(at[..., 1]) / (1 - self.share * velocity[..., 1] / self.size_px[1])
         return np.asarray(at + velocity * late[..., None])
 
@@ -365,7 +367,7 @@ class CameraPlacement:
         if self.rate is not None:
             late = self._late(np.asarray(xy, np.float64)[..., 1])
             ray[..., :2] *= np.exp(-self.rate[0] * late)[..., None]
-            ray = _turned_by(ray, -self.rate[1:] * late[..., None])
+            ray = rotation.turned(ray, -self.rate[1:] * late[..., None])
         directions = (ray / np.linalg.norm(ray, axis=-1, keepdims=True)) @ self.pose.R
         return directions if self.parallax is None else self.parallax.from_axis(directions, self.pose.R[2])
 
@@ -378,12 +380,5 @@ class CameraPlacement:
     def _late(self, y_px: FloatArray) -> FloatArray:
         """By how much of a frame's time (...) the row at y_px was read after the middle one; half a picture beyond the
         first and last row at most."""
-        where = (np.nan_to_num(y_px) + 0.5) / self.size_px[1] - 0.5
+        where = row_delay(np.nan_to_num(y_px), self.size_px[1])
         return np.asarray(self.share * np.clip(where, -1.0, 1.0))
-
-
-def _turned_by(vectors: FloatArray, turn: FloatArray) -> FloatArray:
-    """exp(turn) vectors, both (..., 3), for turns of a few hundredths rad: to the third order."""
-    once = np.cross(turn, vectors)
-    twice = np.cross(turn, once)
-    return np.asarray(vectors + once + twice / 2 + np.cross(turn, twice) / 6)

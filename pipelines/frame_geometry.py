@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.parallax import Parallax
-from calib.rolling_shutter import motion_rates
+from calib.rolling_shutter import motion_rates, row_delay
 from calib.rotation import from_pan_tilt_roll
 from pipelines.pupil_facts import parallax_of
 from pipelines.records import CameraTable, RunRecord
@@ -42,7 +42,7 @@ class FrameGeometry:
 
     def late(self, row: ArrayLike, y_px: ArrayLike) -> FloatArray:
         """By how many pictures' time (...) a pixel at y_px (...) was read after its frame's middle; 0 for NaN."""
-        where = (np.nan_to_num(np.asarray(y_px, np.float64)) + 0.5) / self.height_px - 0.5
+        where = row_delay(np.nan_to_num(np.asarray(y_px, np.float64)), self.height_px)
         return np.asarray(self.share[np.asarray(row)] * np.clip(where, -FARTHEST, FARTHEST))
 
     def turn(self, row: ArrayLike, late: ArrayLike) -> tuple[FloatArray, FloatArray]:

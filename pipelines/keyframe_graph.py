@@ -108,6 +108,11 @@ class KeyframeResult:
     readout: RollingShutter | None = None
 
     @property
+    def readout_share(self) -> float | None:
+        """Of a frame's time, by the rolling shutter; None where none was found."""
+        return self.readout.share if self.readout is not None and self.readout.found else None
+
+    @property
     def parallax(self) -> Parallax | None:
         """Of the pupil, in the solution's axes; None where none was found."""
         return None if self.pupil is None else self.pupil.parallax

@@ -59,8 +59,8 @@ def _leaves_the_line(solution: Solution, limit_px: float) -> NDArray[np.bool_]:
     return out
 
 
-def verified_frames(frames: NDArray[np.int64], fits: Iterable[PairFit], reference: int) -> NDArray[np.bool_]:
-    """(n,) bool: frames that pairs of status 'ok', none of them composed, join to the reference frame."""
+def verified_parts(frames: NDArray[np.int64], fits: Iterable[PairFit]) -> NDArray[np.int64]:
+    """(n,) one of its own frames for each part that pairs of status 'ok', none of them composed, hold together."""
     root = {int(f): int(f) for f in frames}
 
     def find(frame: int) -> int:
@@ -72,10 +72,14 @@ def verified_frames(frames: NDArray[np.int64], fits: Iterable[PairFit], referenc
     for fit in fits:
         if fit.status == PairStatus.OK and fit.route != "composed" and fit.src in root and fit.dst in root:
             root[find(fit.src)] = find(fit.dst)
-    if reference not in root:
-        return np.zeros(len(frames), bool)
-    home = find(reference)
-    return np.array([find(int(f)) == home for f in frames], bool)
+    return np.array([find(int(f)) for f in frames], np.int64)
+
+
+def verified_frames(frames: NDArray[np.int64], fits: Iterable[PairFit], reference: int) -> NDArray[np.bool_]:
+    """(n,) bool: frames that are in the reference's part; none where the reference is not among them."""
+    parts = verified_parts(frames, fits)
+    home = parts[np.asarray(frames) == reference]
+    return np.isin(parts, home)
 
 
 def without_doubtful(solution: Solution, fits: Iterable[PairFit]) -> tuple[Solution, set[int]]:

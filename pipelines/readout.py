@@ -82,8 +82,8 @@ def without_readout(graph: HomographyGraph, track: Solution, result: KeyframeRes
     """A graph of frames without what keyframes' pupil and rolling shutter moved in it; track: its frames' cameras."""
     if result.parallax is not None:
         graph = without_parallax(graph, track, result.parallax)
-    if result.readout is not None and result.readout.found:
-        graph = without_rolling_shutter(graph, track, result.readout.share)
+    if result.readout_share is not None:
+        graph = without_rolling_shutter(graph, track, result.readout_share)
     return graph
 
 

@@ -230,12 +230,11 @@ def solve_shot(
     try:
         with timings.measure("second pass"):
             planned = set(plan.frames)
-            found = result.readout
             fits = second_pass(
                 frames(),
                 Retracker(
                     tracker, approximate, config.registration, tracker.register_options,
-                    rolling=rolling_of(found.share, approximate) if found is not None and found.found else None,
+                    rolling=rolling_of(result.readout_share, approximate),
                 ),
                 MovingFinder({p.frame: p for p in placed}, planned, store, tracker.screen_mask),
                 store,
@@ -341,8 +340,7 @@ def placements_of(
     parallax = keyframes.parallax
     turned = None if parallax is None else parallax.of_axes(R_surface_world)
     motion = {o.frame: o.motion_px for o in observations}
-    found = keyframes.readout
-    rolling = rolling_of(found.share, solution) if found is not None and found.found else None
+    rolling = rolling_of(keyframes.readout_share, solution)
     rates = {} if rolling is None else rolling.rates
     return [
         CameraPlacement(
@@ -436,7 +434,7 @@ def frame_poses(
     between = [f for f in fits if not (f.src in tracker.keyframes and f.dst in tracker.keyframes)]
     graph = homography_graph(frames, between, tracker.size_px)
     bars = PoseOptions(error_bars=error_bars)
-    if result.parallax is None and not (result.readout is not None and result.readout.found):
+    if result.parallax is None and result.readout_share is None:
         return _with_duplicates(solve_poses(graph, held, options=bars, start=start), tracker)
     # What pupil and shutter did to a pair wants cameras only roughly: those of an earlier track will do.
     rough = start if start is not None else solve_poses(graph, held, options=PoseOptions(error_bars=False))

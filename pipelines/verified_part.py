@@ -12,8 +12,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.records import PairFit, PairStatus
-from pipelines.links import verified_frames
+from mosaic.records import PairFit
+from pipelines.links import verified_frames, verified_parts
 
 log = logging.getLogger(__name__)
 
@@ -24,15 +24,10 @@ LEAST_KEYFRAMES = 2
 
 def largest_verified(frames: Sequence[int], fits: Iterable[PairFit]) -> set[int]:
     """The largest set of frames that pairs of status 'ok', none of them composed, hold together."""
-    pairs = [f for f in fits if f.status == PairStatus.OK and f.route != "composed"]
     numbers = np.asarray(sorted(frames), np.int64)
-    left, best = set(numbers.tolist()), set[int]()
-    while len(left) > len(best):
-        part = set(numbers[verified_frames(numbers, pairs, min(left))].tolist())
-        left -= part
-        if len(part) > len(best):
-            best = part
-    return best
+    parts = verified_parts(numbers, fits)
+    names, sizes = np.unique(parts, return_counts=True)
+    return set(numbers[parts == names[np.argmax(sizes)]].tolist())
 
 
 def part_to_solve_alone(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from pipelines.archive import COLUMNS
 from pipelines.records import CameraTable, RunRecord, ShotRecord
+from tests.synth.camera import SynthCamera
 
 EMPTY = math.nan
 
@@ -28,6 +30,22 @@ def camera_table(n: int, **columns: Any) -> CameraTable:
     values: dict[str, Any] = {**texts, **counts, **{name: np.full(n, EMPTY) for name in floats}}
     values["homography"] = np.full((n, 3, 3), EMPTY)
     return CameraTable(**{**values, **columns})
+
+
+def table_of_cameras(cameras: Sequence[SynthCamera], **columns: Any) -> CameraTable:
+    """A row a camera of the generator, with nothing else known, but for `columns`."""
+    return camera_table(
+        len(cameras),
+        f_px=np.array([c.f_px for c in cameras]),
+        aspect=np.ones(len(cameras)),
+        cx_px=np.array([c.cx_px for c in cameras]),
+        cy_px=np.array([c.cy_px for c in cameras]),
+        k1=np.array([c.k1_opencv for c in cameras]),
+        pan_deg=np.degrees([c.pan_rad for c in cameras]),
+        tilt_deg=np.degrees([c.tilt_rad for c in cameras]),
+        roll_deg=np.degrees([c.roll_rad for c in cameras]),
+        **columns,
+    )
 
 
 def shot_record(index: int = 0, **values: Any) -> ShotRecord:

@@ -22,9 +22,8 @@ from pipelines.render.opened import open_run
 from pipelines.render.overlay import OverlayOptions, overlay
 from pipelines.render.views import frame_view
 from tests.pipelines.end_to_end import SIZE, pan_spec
-from tests.pipelines.tables import camera_table, run_record, shot_record
+from tests.pipelines.tables import camera_table, run_record, shot_record, table_of_cameras
 from tests.pipelines.test_render import decoded, disc_slips
-from tests.synth.camera import SynthCamera
 from tests.synth.clip import write_clip
 from tests.synth.paths import BROADCAST_LENS, CameraPath
 
@@ -54,21 +53,6 @@ def true_pixel(frame: int, ray: np.ndarray, path: CameraPath = PATH) -> np.ndarr
     return np.asarray(path.camera(row_time(frame, low)).ray_to_pixel(ray))
 
 
-def table_of(cameras: list[SynthCamera]) -> CameraTable:
-    """camera.csv of the middle rows."""
-    return camera_table(
-        len(cameras),
-        f_px=np.array([c.f_px for c in cameras]),
-        aspect=np.ones(len(cameras)),
-        cx_px=np.array([c.cx_px for c in cameras]),
-        cy_px=np.array([c.cy_px for c in cameras]),
-        k1=np.array([c.k1_opencv for c in cameras]),
-        pan_deg=np.degrees([c.pan_rad for c in cameras]),
-        tilt_deg=np.degrees([c.tilt_rad for c in cameras]),
-        roll_deg=np.degrees([c.roll_rad for c in cameras]),
-    )
-
-
 def with_times(table: CameraTable) -> CameraTable:
     """The table with statuses, and times of 25 pictures a second."""
     return dataclasses.replace(table, status=("ok",) * len(table), pts_s=np.arange(len(table)) / 25.0)
@@ -81,7 +65,7 @@ def record(found: bool = True, pupil: dict[str, object] | None = None) -> RunRec
 
 @pytest.fixture(scope="module")
 def table() -> CameraTable:
-    return table_of(PATH.cameras())
+    return table_of_cameras(PATH.cameras())
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +160,7 @@ def test_what_was_not_found_changes_nothing(table: CameraTable) -> None:
 
 def test_a_frame_without_neighbours_is_taken_to_stand_still() -> None:
     cameras = PATH.cameras()
-    table = table_of(cameras)
+    table = table_of_cameras(cameras)
     f = np.array(table.f_px)
     f[[24, 26]] = np.nan
     lone = camera_table(
@@ -221,7 +205,7 @@ def test_an_overlay_sticks_to_a_clip_of_a_rolling_shutter(tmp_path: Path) -> Non
             out / "run.json",
             dataclasses.replace(known, clip={**known.clip, "path": str(clip), "picture_fps": 25}),
         )
-        write_camera_csv(out / "camera.csv", with_times(table_of(path.cameras())))
+        write_camera_csv(out / "camera.csv", with_times(table_of_cameras(path.cameras())))
         options = OverlayOptions(
             picture=tmp_path / "discs.png", corners=at.pixel_to_ray(corners), space="rays", in_front=True
         )

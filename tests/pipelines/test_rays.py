@@ -23,7 +23,7 @@ from pipelines.rays import (
 )
 from tests.pipelines.end_to_end import SIZE, Finished, one_line
 from tests.pipelines.export_truth import FIRST, LOST, N, truth
-from tests.pipelines.tables import camera_table
+from tests.pipelines.tables import camera_table, table_of_cameras
 from tests.pipelines.test_export_command import finished
 from tests.synth.camera import SynthCamera, pixel_grid
 
@@ -52,18 +52,7 @@ def generator_cameras(n: int = 12) -> list[SynthCamera]:
 def test_rays_are_the_generators() -> None:
     """Frames broadcast against a grid of pixels; the frames are not in order."""
     cameras = generator_cameras()
-    table = camera_table(
-        len(cameras),
-        frame=np.arange(len(cameras))[::-1] + 5,
-        f_px=np.array([c.f_px for c in cameras]),
-        aspect=np.ones(len(cameras)),
-        cx_px=np.array([c.cx_px for c in cameras]),
-        cy_px=np.array([c.cy_px for c in cameras]),
-        k1=np.array([c.k1_opencv for c in cameras]),
-        pan_deg=np.degrees([c.pan_rad for c in cameras]),
-        tilt_deg=np.degrees([c.tilt_rad for c in cameras]),
-        roll_deg=np.degrees([c.roll_rad for c in cameras]),
-    )
+    table = table_of_cameras(cameras, frame=np.arange(len(cameras))[::-1] + 5)
     grid = pixel_grid(1280, 720, 79)
     rays = pixel_to_ray(table, table.frame[:, None, None], grid)
     true = np.stack([c.pixel_to_ray(grid) for c in cameras])
