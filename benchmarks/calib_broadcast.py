@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import GateOptions, HomographyGraph, Priors, RefineOptions, Solution, fit_pupil, judge, refine
-from calib.camera import N_COLUMNS
+from calib.camera import N_POSES, N_SHARED
 from calib.problem import Loss, PriorTerms, State, linearise, pack, residuals
 from calib.refine_options import free_columns
 from calib.solver import Layout, NormalEquations
@@ -113,7 +113,7 @@ def bounds(row: Row, seed: int) -> tuple[float, float]:
     best, meat = np.zeros((size, size)), np.zeros((size, size))
     for e in range(packed.n_edges):
         m = int((packed.dof[e] > 0).sum())
-        De = np.moveaxis(J[0, e, :, :, :m], 0, 2).transpose(1, 0, 2).reshape(2 * m, N_COLUMNS)
+        De = np.moveaxis(J[0, e, :, :, :m], 0, 2).transpose(1, 0, 2).reshape(2 * m, N_POSES + N_SHARED)
         cells = [int(np.argmin(np.sum((tracks.grid(FULL_HD) - p) ** 2, 1))) for p in good[e].grid_a]
         pick = (2 * np.array(cells)[:, None] + np.arange(2)).ravel()
         V = everywhere[np.ix_(pick, pick)]

@@ -6,11 +6,13 @@ the errors of its registration, so the sandwich over edges is what gets publishe
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import homography
-from calib.camera import N_SHARED
+from calib.camera import SHARED
 from calib.problem import Loss, Packed, PriorTerms, State, chunks, residuals, whitened_squares
 from calib.records import Lens, Priors, Solution, StartResult
 from calib.solver import Layout, NormalEquations, Result
@@ -99,7 +101,7 @@ def perspective_signal(packed: Packed, state: State, layout: Layout, direction: 
     denominator = float(u @ direction)
     if not np.isfinite(denominator) or denominator <= 0:
         return 0.0
-    a = (0.1 * direction / denominator)[layout.columns]  # (E, 13)
+    a = (0.1 * direction / denominator)[layout.columns]  # (E, 8 + s)
     best = 0.0
     for part in chunks(packed.n_edges, 1, packed.dof.shape[1]):
         _, _, J = residuals(packed, state, part, jacobian=True)
@@ -125,14 +127,16 @@ def summarise(
     _, weight = loss.value_and_weight(whitened)
     with np.errstate(invalid="ignore"):  # a point outside the lens model has infinite misfit and no weight
         chi2_dof = float(np.nansum(weight * whitened) / dof)
-    lens_values = state.shared[0]
+    values, names = state.shared[0], SHARED[: layout.n_shared]
     lens = Lens(
-        size_px=packed.size_px, pp_px=lens_values[:2], aspect=float(np.exp(lens_values[2])),
-        c0=float(lens_values[3]), c1=float(lens_values[4]),
+        size_px=packed.size_px, pp_px=values[:2], aspect=float(np.exp(values[2])), c0=float(values[3]),
+        c1=float(values[4]),
     )  # fmt: skip
+    if len(values) > 5:
+        lens = replace(lens, k2=float(values[5]), pp_drift_px=values[6:], pp_log_f=packed.log_f_pp)
     sigma_log_f, sigma_zoom = np.full(n, np.nan), np.full(n, np.nan)
     cov_rot = np.full((n, 3, 3), np.nan)
-    lens_std: dict[str, float] = dict.fromkeys(("pp_x", "pp_y", "log_aspect", "c0", "c1"), float("nan"))
+    lens_std: dict[str, float] = dict.fromkeys(names, float("nan"))
     formal = sigma_mean = float("nan")
     s10, factor = 0.0, 1.0
     converged = bool(result.converged[0])
@@ -158,7 +162,7 @@ def summarise(
         cov_rot = blocks[:, 1:, 1:] * factor**2
         lens_std = {
             name: float(np.sqrt(shared[k])) * factor if layout.active[4 * n + k] else 0.0
-            for k, name in enumerate(("pp_x", "pp_y", "log_aspect", "c0", "c1"))
+            for k, name in enumerate(names)
         }
     except np.linalg.LinAlgError:
         converged = False
@@ -217,4 +221,4 @@ def _cluster_sigma(
     return float(np.sqrt(max(from_kappa, data * chi2 + prior)))
 
 
-__all__ = ["N_SHARED", "edge_statistics", "homography_energy", "perspective_signal", "summarise"]
+__all__ = ["edge_statistics", "homography_energy", "perspective_signal", "summarise"]

@@ -23,19 +23,39 @@ def k1_from_opencv(k1_opencv: ArrayLike, f_px: ArrayLike, width_px: float) -> Ar
     return np.asarray(k1_opencv, float) / (2 * np.asarray(f_px, float) / width_px) ** 2
 
 
+def fold_square(k1_half: ArrayLike, k2_half: ArrayLike = 0.0) -> Array:
+    """Square of the ideal radius, half widths, up to which the model is one to one; inf where it never folds.
+
+    The first zero of 1 + 3 k1 x + 5 k2 x^2 in x = rho^2: beyond it radii come back, and a second branch may follow.
+    """
+    k1, k2 = np.asarray(k1_half, float), np.asarray(k2_half, float)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # In this form of the root no small k2 stands in a denominator.
+        inverse = -3 * k1 + np.sqrt(9 * k1 * k1 - 20 * k2)
+        return np.where(inverse > 0, 2 / inverse, np.inf)
+
+
 def undistorted_radius(rho_observed: ArrayLike, k1_half: ArrayLike, k2_half: ArrayLike = 0.0) -> Array:
     """Ideal radius rho with rho (1 + k1 rho^2 + k2 rho^4) = rho_observed, in half widths; NaN where none exists."""
     rho_d = np.asarray(rho_observed, float)
     k1, k2 = np.asarray(k1_half, float), np.asarray(k2_half, float)
     with np.errstate(over="ignore", invalid="ignore"):
-        rho = rho_d / (1 + np.maximum(k1, -0.2) * np.minimum(rho_d, 2.0) ** 2)
+        r2 = np.square(np.minimum(rho_d, 2.0))
+        rho = rho_d / (1 + np.maximum(k1 + k2 * r2, -0.2) * r2)
+        one = not np.any(k2)  # the usual lens, and half the arithmetic
         for _ in range(NEWTON_STEPS):
             r2 = rho * rho
-            slope = 1 + r2 * (3 * k1 + 5 * k2 * r2)
-            rho = rho - (rho * (1 + r2 * (k1 + k2 * r2)) - rho_d) / np.maximum(slope, 0.05)
+            bend = k1 * r2 if one else (k1 + k2 * r2) * r2
+            slope = 1 + 3 * bend if one else 1 + r2 * (3 * k1 + 5 * k2 * r2)
+            step = (rho * (1 + bend) - rho_d) / np.maximum(slope, 0.05)
+            rho = rho - step
+            # Newton's error is about squared by a step: after one this small, the next would be below rounding.
+            if np.abs(step).max(initial=0.0) < 1e-9:
+                break
         r2 = rho * rho
-        valid = (1 + r2 * (3 * k1 + 5 * k2 * r2) > 0) & (rho >= 0)
-        valid &= np.abs(rho * (1 + r2 * (k1 + k2 * r2)) - rho_d) <= 1e-9 * (1 + rho_d)
+        bend = k1 * r2 if one else (k1 + k2 * r2) * r2
+        valid = (1 + 3 * bend > 0 if one else r2 < fold_square(k1, k2)) & (rho >= 0)
+        valid &= np.abs(rho * (1 + bend) - rho_d) <= 1e-9 * (1 + rho_d)
     return np.where(valid, rho, np.nan)
 
 
@@ -47,7 +67,7 @@ def distort(
     d = np.asarray(points_px, float) - pp
     k1 = np.asarray(k1_half, float)[..., None]
     r2 = np.sum(d * d, -1, keepdims=True) / (width_px / 2) ** 2
-    folded = 1 + r2 * (3 * k1 + 5 * k2_half * r2) <= 0
+    folded = r2 >= fold_square(k1, k2_half)
     return np.where(folded, np.nan, pp + d * (1 + r2 * (k1 + k2_half * r2)))
 
 
@@ -64,5 +84,4 @@ def undistort(
 
 def is_invertible(k1_half: float, size_px: tuple[int, int], k2_half: float = 0.0) -> bool:
     """Whether the model is one to one up to the picture's corner (16:9, k2 = 0: k1_half > -0.25)."""
-    rho = np.linspace(0, np.hypot(1.0, size_px[1] / size_px[0]), 65)
-    return bool(np.all(1 + 3 * k1_half * rho**2 + 5 * k2_half * rho**4 > 0))
+    return bool(1 + (size_px[1] / size_px[0]) ** 2 < fold_square(k1_half, k2_half))

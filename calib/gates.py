@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import rotation
+from calib import distortion, rotation
 from calib.records import HomographyGraph, Solution, Verdict
 from calib.refine import RefineOptions
 from calib.systematic import distortion_extreme, sigma_parts
@@ -196,7 +196,7 @@ def _reason(
 def _invertible(solution: Solution) -> NDArray[np.bool_]:
     W, H = solution.lens.size_px
     k1 = solution.lens.k1_half(solution.log_f[np.isfinite(solution.log_f)])
-    return 1 + 3 * k1 * (1 + (H / W) ** 2) > 0
+    return np.asarray(distortion.fold_square(k1, solution.lens.k2) > 1 + (H / W) ** 2)
 
 
 def _ambiguous(solution: Solution, total: float) -> bool:

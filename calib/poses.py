@@ -87,7 +87,7 @@ def _iterate(
 ) -> tuple[State, float, bool, int, sp.csc_array | None]:
     """Levenberg-Marquardt on the free frames: state, cost, converged, steps, undamped matrix at the end."""
     lin = linearise(packed, state, loss, pose_only=True)
-    cost, damping, shared = float(lin.cost[0]), 1e-6, np.zeros((1, 5))
+    cost, damping, shared = float(lin.cost[0]), 1e-6, np.zeros_like(state.shared)
     if not np.isfinite(cost):
         return state, cost, False, 0, None
     step_count = 0

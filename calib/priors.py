@@ -54,7 +54,8 @@ class LensProfile:
     """The lens of a calibrated shot, for the next: k1_half(f) = c0 + c1 log(f / W) with errors, and where it was seen.
 
     pp_offset_w: principal point less the centre, in widths, (x, y), and its errors. log_f_w: range of log(f / W) that
-    the shot covered: outside of it c1 is an extrapolation.
+    the shot covered: outside of it c1 is an extrapolation. k2, k2_std: the second coefficient, 0 where the shot was
+    calibrated without one. A drift of the principal point is not kept.
     """
 
     c0: float
@@ -64,6 +65,8 @@ class LensProfile:
     pp_offset_w: tuple[float, float]
     pp_std_w: tuple[float, float]
     log_f_w: tuple[float, float]
+    k2: float = 0.0
+    k2_std: float = 0.0
 
     def save(self, path: str | Path) -> None:
         """Write as JSON."""
@@ -101,7 +104,7 @@ def lens_profile(solution: Solution) -> LensProfile:
         c0=lens.c0, c1=lens.c1, c0_std=std.get("c0", 0.0) or priors.c0_std, c1_std=std.get("c1", 0.0) or priors.c1_std,
         pp_offset_w=(float(offset[0]), float(offset[1])),
         pp_std_w=((std.get("pp_x", 0.0) or priors.pp_std_x * W) / W, (std.get("pp_y", 0.0) or priors.pp_std_y * W) / W),
-        log_f_w=(float(log_f_w.min()), float(log_f_w.max())),
+        log_f_w=(float(log_f_w.min()), float(log_f_w.max())), k2=lens.k2, k2_std=std.get("k2", 0.0),
     )  # fmt: skip
 
 
@@ -109,12 +112,14 @@ def with_profile(priors: Priors, profile: LensProfile, *, trust: float = 2.0) ->
     """The priors with the distortion of a profile; the principal point stays the priors' (parallax is in it).
 
     trust: factor on the profile's statistical errors, which do not contain what a shot's edges share. Never wider than
-    the priors were. The correlation of c0 and c1 is left out: on the safe side within the profile's range. Raises
-    ValueError unless trust is positive.
+    the priors were. The correlation of c0 and c1 is left out: on the safe side within the profile's range. A profile
+    with a k2 hands it on, held where the priors do not free it. Raises ValueError unless trust is positive.
     """
     if not trust > 0:
         raise ValueError(f"trust must be positive, got {trust}")
     return replace(
         priors, c0_mean=profile.c0, c0_std=min(trust * profile.c0_std, priors.c0_std),
         c1_mean=profile.c1, c1_std=min(trust * profile.c1_std, priors.c1_std),
+        k2_mean=profile.k2 or priors.k2_mean,
+        k2_std=min(trust * profile.k2_std, priors.k2_std) if profile.k2 else priors.k2_std,
     )  # fmt: skip

@@ -1,20 +1,20 @@
 """A graph as arrays, and its robust least-squares linearisation per edge. No solving here.
 
 Everything carries a leading axis of starts, so that a multistart costs one pass. An edge's block is 13 x 13 over
-(log f_a, rot_a, log f_b, rot_b, shared 5).
+(log f_a, rot_a, log f_b, rot_b, shared 5), or 16 x 16 with the shared 8 of the wider lens.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import camera, rotation
 from calib.dlt import square_root_information
-from calib.records import HomographyEdge, HomographyGraph, Priors
+from calib.records import HomographyEdge, HomographyGraph, Priors, Solution
 
 Array = NDArray[np.float64]
 # Points linearised at once: ~100 arrays of them are the working set (measured: 90 ms for 156,000 points at 8,000 to
@@ -27,7 +27,8 @@ class Packed:
     """Edges as arrays, padded to the longest.
 
     ia, ib (E,) frame rows; a_x .. b_y (E, m) raw px; s11, s12, s22 (E, m) square root of the information; dof (E, m)
-    directions known better than 1 px (0, 1 or 2); H (E, 3, 3) as handed in.
+    directions known better than 1 px (0, 1 or 2); H (E, 3, 3) as handed in. log_f_pp: log f at which a State's
+    principal point holds; of no effect but on a principal point that drifts.
     """
 
     ia: NDArray[np.int64]
@@ -43,6 +44,7 @@ class Packed:
     H: Array
     n_frames: int
     size_px: tuple[int, int]
+    log_f_pp: float
 
     @property
     def n_edges(self) -> int:
@@ -56,10 +58,10 @@ class Packed:
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Packed:
         """The same frames with some of the edges."""
-        return Packed(
-            ia=self.ia[keep], ib=self.ib[keep], a_x=self.a_x[keep], a_y=self.a_y[keep], b_x=self.b_x[keep],
+        return replace(
+            self, ia=self.ia[keep], ib=self.ib[keep], a_x=self.a_x[keep], a_y=self.a_y[keep], b_x=self.b_x[keep],
             b_y=self.b_y[keep], s11=self.s11[keep], s12=self.s12[keep], s22=self.s22[keep], dof=self.dof[keep],
-            H=self.H[keep], n_frames=self.n_frames, size_px=self.size_px,
+            H=self.H[keep],
         )  # fmt: skip
 
     def thin(self, n_points: int) -> Packed:
@@ -80,10 +82,9 @@ class Packed:
         def take(values: Array) -> Array:
             return np.take_along_axis(values, pick, 1)
 
-        return Packed(
-            ia=self.ia, ib=self.ib, a_x=take(self.a_x), a_y=take(self.a_y), b_x=take(self.b_x), b_y=take(self.b_y),
+        return replace(
+            self, a_x=take(self.a_x), a_y=take(self.a_y), b_x=take(self.b_x), b_y=take(self.b_y),
             s11=take(self.s11), s12=take(self.s12), s22=take(self.s22), dof=take(self.dof),
-            H=self.H, n_frames=self.n_frames, size_px=self.size_px,
         )  # fmt: skip
 
     def points(self) -> tuple[Array, Array, Array]:
@@ -123,13 +124,13 @@ def pack(graph: HomographyGraph, edges: Sequence[HomographyEdge] | None = None) 
         a_x=grid_a[..., 0].copy(), a_y=grid_a[..., 1].copy(), b_x=grid_b[..., 0].copy(), b_y=grid_b[..., 1].copy(),
         s11=S[..., 0, 0].copy(), s12=S[..., 0, 1].copy(), s22=S[..., 1, 1].copy(), dof=dof,
         H=np.array([e.H for e in edges], float).reshape(-1, 3, 3),
-        n_frames=len(graph.frames), size_px=graph.size_px,
+        n_frames=len(graph.frames), size_px=graph.size_px, log_f_pp=float(np.log(graph.size_px[0])),
     )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Unknowns of S starts: log_f (S, n), R (S, n, 3, 3), shared (S, 5) = pp_x, pp_y, log aspect, c0, c1."""
+    """Unknowns of S starts: log_f (S, n), R (S, n, 3, 3), shared (S, 5) = pp_x, pp_y, log aspect, c0, c1, or (S, 8)."""
 
     log_f: Array
     R: Array
@@ -140,16 +141,21 @@ class State:
         return State(self.log_f[which], self.R[which], self.shared[which])
 
     def moved(self, frames: Array, shared: Array) -> State:
-        """Steps (S, n, 4) and (S, 5) applied: rotations from the left, made orthonormal again."""
+        """Steps (S, n, 4) and (S, 5 or 8) applied: rotations from the left, made orthonormal again."""
         R = rotation.orthonormalise(rotation.exp(frames[..., 1:]) @ self.R)
         return State(self.log_f + frames[..., 0], R, self.shared + shared)
+
+
+def state_of(packed: Packed, solution: Solution) -> State:
+    """A solution of the packed frames as a State of one start."""
+    return State(solution.log_f[None], solution.R[None], solution.lens.shared(packed.log_f_pp)[None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linearised:
     """cost (S,) robust; blocks (S, E, 13, 13) J^T W J; gradient (S, E, 13) J^T W r; e2 (S, E, m) squares, whitened.
 
-    An impossible state has cost inf.
+    (16 of the wider lens.) An impossible state has cost inf.
     """
 
     cost: Array
@@ -202,7 +208,7 @@ def residuals(
     Ra, Rb = state.R[:, ia], state.R[:, ib]
     out = camera.transfer(
         packed.a_x[which], packed.a_y[which], state.log_f[:, ia], state.log_f[:, ib],
-        Rb @ np.swapaxes(Ra, -1, -2), state.shared[:, None], packed.size_px[0],
+        Rb @ np.swapaxes(Ra, -1, -2), state.shared[:, None], packed.size_px[0], log_f_pp=packed.log_f_pp,
         jacobian=jacobian, pose_only=pose_only,
     )  # fmt: skip
     return packed.b_x[which] - out.x, packed.b_y[which] - out.y, out.J  # type: ignore[return-value]
@@ -235,7 +241,7 @@ class AdaptiveLoss(Loss):
 def linearise(packed: Packed, state: State, loss: Loss, *, pose_only: bool = False) -> Linearised:
     """Cost, normal blocks and gradients per edge at a state; pose_only leaves the shared columns out (8 x 8 blocks)."""
     S, E, m = len(state.log_f), packed.n_edges, packed.dof.shape[1]
-    n_columns = 8 if pose_only else 13
+    n_columns = camera.N_POSES if pose_only else camera.N_POSES + state.shared.shape[1]
     blocks, gradient = np.empty((S, E, n_columns, n_columns)), np.empty((S, E, n_columns))
     e2_all, cost = np.empty((S, E, m)), np.zeros(S)
     with np.errstate(all="ignore"):
@@ -277,25 +283,21 @@ def robust_scale(e2: Array, dof: Array) -> Array:
 
 
 class PriorTerms:
-    """Gaussian priors as additions to cost, normal matrix and gradient; `free` says which shared columns move."""
+    """Gaussian priors as additions to cost, normal matrix and gradient; `free` (5,) or (8,): which shared ones move."""
 
     def __init__(
         self, priors: Priors, size_px: tuple[int, int], frames: NDArray[np.int64], free: NDArray[np.bool_]
     ) -> None:
         W = size_px[0]
-        self.mean = np.array(
-            [*priors.pp_mean_px(size_px), np.log(priors.aspect), priors.c0_mean, priors.c1_mean]
-        )
-        self.std = np.array(
-            [
-                priors.pp_std_x * W,
-                priors.pp_std_y * W,
-                max(priors.aspect_std, 1e-9),
-                priors.c0_std,
-                priors.c1_std,
-            ]
-        )
         self.free = np.asarray(free, bool)
+        pp = priors.pp_mean_px(size_px)
+        mean = [*pp, np.log(priors.aspect), priors.c0_mean, priors.c1_mean, priors.k2_mean, 0.0, 0.0]
+        std = [
+            priors.pp_std_x * W, priors.pp_std_y * W, priors.aspect_std, priors.c0_std, priors.c1_std,
+            priors.k2_std, priors.pp_drift_std * W, priors.pp_drift_std * W,
+        ]  # fmt: skip
+        self.mean = np.array(mean[: len(self.free)])
+        self.std = np.maximum(np.array(std[: len(self.free)]), 1e-9)
         self.precision = np.where(self.free, 1 / self.std**2, 0.0)
         self.mean_log_f, self.mean_precision = priors.log_f_mean + np.log(W), 1 / priors.log_f_std**2
         rows = {frame: k for k, frame in enumerate(frames.tolist())}
@@ -317,7 +319,7 @@ class PriorTerms:
         )
 
     def shared_gradient(self, state: State) -> Array:
-        """J^T W r of the shared parameters (S, 5)."""
+        """J^T W r of the shared parameters (S, 5 or 8)."""
         return self.precision * (self.mean - state.shared)
 
     def mean_gradient(self, state: State) -> Array:

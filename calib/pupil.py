@@ -13,9 +13,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.camera import SHARED
 from calib.level import LevelOptions, level
 from calib.parallax import Parallax
-from calib.problem import Loss, Packed, PriorTerms, State, linearise, pack, residuals
+from calib.problem import Loss, Packed, PriorTerms, linearise, pack, residuals, state_of
 from calib.records import HomographyGraph, Solution
 from calib.refine import RefineOptions, refine
 from calib.solver import Layout, NormalEquations
@@ -124,10 +125,10 @@ def _step(
     """Gauss-Newton step of the ratios with everything else re-optimised, and their covariance; graph as measured."""
     edges = [e for e, ok in zip(graph.edges, solution.edge_ok, strict=True) if ok]
     packed = pack(graph, edges)
-    lens = solution.lens
-    shared = np.array([[*lens.pp_px, np.log(lens.aspect), lens.c0, lens.c1]])
-    state = State(solution.log_f[None], solution.R[None], shared)
-    free = np.array([solution.lens_std.get(k, 0.0) > 0 for k in ("pp_x", "pp_y", "log_aspect", "c0", "c1")])
+    if solution.lens.is_wide:  # the prior of a drifting principal point is of where the solution has it
+        packed = replace(packed, log_f_pp=solution.lens.pp_log_f)
+    state = state_of(packed, solution)
+    free = np.array([solution.lens_std.get(k, 0.0) > 0 for k in SHARED[: state.shared.shape[1]]])
     terms = PriorTerms(solution.priors, graph.size_px, graph.frames, free)
     layout = Layout(packed, solution.index(solution.reference), free)
     loss = Loss("huber", np.array([max(1.0, float(np.sqrt(solution.chi2_dof)))]))

@@ -90,16 +90,24 @@ class HomographyGraph:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lens:
-    """Principal point, aspect = fx / fy, and distortion k1_half(f) = c0 + c1 log(f / W) of a shot."""
+    """Principal point, aspect = fx / fy, and distortion k1_half(f) = c0 + c1 log(f / W) of a shot.
+
+    The wider lens: k2, of the fourth power of the radius (half widths) at every focal; pp_drift_px (2,) px per unit of
+    log f, by which the principal point moves from pp_px, where it is at log f = pp_log_f.
+    """
 
     size_px: tuple[int, int]
     pp_px: Array
     aspect: float = 1.0
     c0: float = 0.0
     c1: float = 0.0
+    k2: float = 0.0
+    pp_drift_px: Array = field(default_factory=lambda: np.zeros(2))
+    pp_log_f: float = 0.0
 
     def __post_init__(self) -> None:
         _freeze(self, "pp_px", (2,))
+        _freeze(self, "pp_drift_px", (2,))
 
     def k1_half(self, log_f: ArrayLike) -> Array:
         """Half-width coefficient (...,) at log focal (...,)."""
@@ -114,16 +122,37 @@ class Lens:
         f = np.exp(np.asarray(log_f, float))
         K = np.zeros((*f.shape, 3, 3))
         K[..., 0, 0], K[..., 1, 1], K[..., 2, 2] = f, f / self.aspect, 1.0
-        K[..., :2, 2] = self.pp_px
+        K[..., :2, 2] = self.pp(log_f)
         return K
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it has more than a fixed principal point and one coefficient of distortion."""
+        return self.k2 != 0 or bool(self.pp_drift_px.any())
+
+    def pp(self, log_f: ArrayLike) -> Array:
+        """Principal point px at log focal (...,): (..., 2); (2,) where it does not drift."""
+        if not self.pp_drift_px.any():
+            return self.pp_px
+        since = np.asarray(log_f, float) - self.pp_log_f
+        return np.asarray(self.pp_px + self.pp_drift_px * since[..., None])
+
+    def shared(self, log_f_pp: float, *, wide: bool | None = None) -> Array:
+        """The unknowns of `camera.SHARED`, (5,) or (8,) for the wider lens; the principal point at log f = log_f_pp."""
+        usual = np.array([*self.pp(log_f_pp), np.log(self.aspect), self.c0, self.c1])
+        return (
+            np.array([*usual, self.k2, *self.pp_drift_px])
+            if (self.is_wide if wide is None else wide)
+            else usual
+        )
 
     def distort(self, ideal_px: ArrayLike, log_f: ArrayLike) -> Array:
         """Ideal pixels (..., 2) to raw pixels; log_f broadcasts against the leading axes. NaN where the model folds."""
-        return distortion.distort(ideal_px, self.pp_px, self.k1_half(log_f), self.size_px[0])
+        return distortion.distort(ideal_px, self.pp(log_f), self.k1_half(log_f), self.size_px[0], self.k2)
 
     def undistort(self, raw_px: ArrayLike, log_f: ArrayLike) -> Array:
         """Raw pixels (..., 2) to ideal pixels. NaN outside the model's range."""
-        return distortion.undistort(raw_px, self.pp_px, self.k1_half(log_f), self.size_px[0])
+        return distortion.undistort(raw_px, self.pp(log_f), self.k1_half(log_f), self.size_px[0], self.k2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,6 +172,10 @@ class Priors:
     the parallax of a pupil in front of the pan axis: an effective one (measured on a soccer and a basketball clip).
     c0_std, c1_std: of k1_half(f) = c0 + c1 log(f / W). log_f_mean, log_f_std: of mean log(f / W); weak, it only keeps
     unobservable shots finite. aspect: fx / fy, fixed while aspect_std is 0. known_focals: from the user.
+    k2_mean, k2_std: of the second coefficient of distortion, fixed while its std is 0 (.02 suits a lens that may have
+    one). pp_drift_std: of the principal point's drift, per unit of log f (none while 0; 10 / 1920 suits a zoom whose
+    centre is seen to move). pp_std_x, pp_std_y then hold at the mean log f of the frames. Take them where the cost of
+    the solution falls by more than some 20 times its edge_kappa. Of calib alone: camera.csv has neither.
     """
 
     pp: tuple[float, float] | None = None  # px
@@ -157,6 +190,14 @@ class Priors:
     aspect: float = 1.0
     aspect_std: float = 0.0
     known_focals: tuple[KnownFocal, ...] = ()
+    k2_mean: float = 0.0
+    k2_std: float = 0.0
+    pp_drift_std: float = 0.0
+
+    @property
+    def wide(self) -> bool:
+        """Whether they ask for more of the lens than a fixed principal point and one coefficient of distortion."""
+        return self.k2_mean != 0 or self.k2_std > 0 or self.pp_drift_std > 0
 
     def pp_mean_px(self, size_px: tuple[int, int]) -> Array:
         """Prior principal point (2,) px."""
@@ -183,7 +224,8 @@ class Solution:
     frames (n,); log_f (n,) of px; R (n, 3, 3) = R_cam_world, I at `reference`; lens. sigma_log_f (n,): absolute,
     statistical (cluster-robust); sigma_log_zoom (n,): of log f - log f(reference); cov_rot (n, 3, 3) rad^2 of the
     left increment.
-    sigma_mean_log_f and its formal value without the edges' common errors; lens_std: pp_x, pp_y px, log_aspect, c0, c1.
+    sigma_mean_log_f and its formal value without the edges' common errors; lens_std: by the names of
+    `camera.SHARED`: pp_x, pp_y px, log_aspect, c0, c1, and of the wider lens k2, pp_drift_x, pp_drift_y px.
     chi2_dof: robust, against the stated information. s10_px: px that 10 % of focal move the best edge.
     Per edge: edge_chi2 (mean square whitened residual per degree of freedom), edge_kappa, edge_ok.
     rms_px (n,): of a frame's residuals. cost, n_steps, converged, stop; starts: what the multistart found;

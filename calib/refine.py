@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib.covariance import summarise
 from calib.edges import find_bad_edges, find_bridge, largest_component, linked_frames, linked_pairs
 from calib.problem import Loss, Packed, PriorTerms, State, pack, robust_scale, whitened_squares
-from calib.records import HomographyGraph, Lens, Priors, Solution, StartResult
+from calib.records import HomographyGraph, Lens, Priors, Solution
 from calib.refine_options import RefineOptions
 from calib.solver import Layout, Result, minimise
 from calib.starts import SCOUT_ABOVE, from_scratch, scouts, warm
@@ -76,25 +76,24 @@ def refine(
             whole = refine(graph, start=first, priors=priors, options=options)
             return replace(whole, starts=first.starts, linear_valid=first.linear_valid)
     prior_args = (priors, graph.size_px)
-    starts: tuple[StartResult, ...] = ()
-    share = float("nan")
     if start is None:
-        found = from_scratch(packed, row, frames, prior_args, options)
-        if found is None:
+        begun = from_scratch(packed, row, frames, prior_args, options)
+        if begun is None:
             return nothing(graph, priors, reference_frame, "no_possible_start")
-        state, ok, free, starts, share, scale = found
     else:
-        state, free, scale = warm(packed, row, frames, start, prior_args, options)
-        ok = np.ones(packed.n_edges, bool)
+        begun = warm(packed, row, frames, start, prior_args, options)
+    packed, free = begun.packed, begun.free
     terms = PriorTerms(priors, graph.size_px, frames, free)
-    result, ok, loss = polish(packed, row, terms, state, ok, scale, free, options)
+    result, ok, loss = polish(packed, row, terms, begun.state, begun.ok, begun.scale, free, options)
     linked = linked_frames(packed, ok, row)
     if 2 * linked.sum() < packed.n_frames:
         other = largest_component(packed, ok)
         if other[0] > linked.sum():
             moved = replace(options, reference=int(frames[other[1]]))
             return refine(graph, start=start, priors=priors, options=moved)
-    solution = summarise(packed, frames, row, terms, result, ok, loss, linked, priors, starts, share)
+    solution = summarise(
+        packed, frames, row, terms, result, ok, loss, linked, priors, begun.starts, begun.valid_share
+    )
     return solution if inside.all() else _spread(solution, graph, inside)
 
 
@@ -152,7 +151,11 @@ def nothing(graph: HomographyGraph, priors: Priors, reference: int, stop: str) -
     n, E = len(graph.frames), len(graph.edges)
     nan = np.full(n, np.nan)
     lens = Lens(
-        size_px=graph.size_px, pp_px=priors.pp_mean_px(graph.size_px), aspect=priors.aspect, c0=priors.c0_mean
+        size_px=graph.size_px,
+        pp_px=priors.pp_mean_px(graph.size_px),
+        aspect=priors.aspect,
+        c0=priors.c0_mean,
+        k2=priors.k2_mean,
     )
     return Solution(
         frames=graph.frames, log_f=nan, R=np.full((n, 3, 3), np.nan), lens=lens, reference=reference,

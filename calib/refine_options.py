@@ -16,12 +16,13 @@ class RefineOptions:
 
     reference: frame with R = I (None: the first of the graph). distortion: False fixes k1 at the priors' mean (for
     comparison only: without it f is 40 % short on real pictures). free_pp: False holds the principal point at its
-    prior. zoom_for_c1: log zoom range below which c1 stays at its prior mean. robust: 'huber' or 'tukey' (Tukey after
-    Huber has converged). huber: threshold in sigmas times the robust scale. bad_edge: an edge whose median residual
-    exceeds this many times the graph's is dropped. tolerance, max_steps: the keyframe graph's valley is flat, an early
-    stop looks like many optima. hopeless_sigma: formal sigma of the leading start from which on only the three best
-    starts are followed (nothing is observable, and the valley has no end).
-    k1_trials, focal_trials_w, focal_k1: the starts. thin: points an edge in the first, coarse look at a start.
+    prior. zoom_for_c1: log zoom range below which c1 stays at its prior mean. The wider lens (k2, a drifting principal
+    point) is asked for by the priors. robust: 'huber' or 'tukey' (Tukey after Huber has converged).
+    huber: threshold in sigmas times the robust scale. bad_edge: an edge whose median residual exceeds this many times
+    the graph's is dropped. tolerance, max_steps: the keyframe graph's valley is flat, an early stop looks like many
+    optima. hopeless_sigma: formal sigma of the leading start from which on only the three best starts are followed
+    (nothing is observable, and the valley has no end). k1_trials, focal_trials_w, focal_k1: the starts. thin: points an
+    edge in the first, coarse look at a start.
     """
 
     reference: int | None = None
@@ -41,14 +42,8 @@ class RefineOptions:
 
 
 def free_columns(priors: Priors, options: RefineOptions, zoom_range: float) -> NDArray[np.bool_]:
-    """Which of pp_x, pp_y, log aspect, c0, c1 move."""
-    k1 = options.distortion
-    return np.array(
-        [
-            options.free_pp,
-            options.free_pp,
-            priors.aspect_std > 0,
-            k1,
-            k1 and zoom_range >= options.zoom_for_c1,
-        ]
-    )
+    """Which of pp_x, pp_y, log aspect, c0, c1 move; where the priors ask for the wider lens also k2, drift (x, y)."""
+    k1, pp = options.distortion, options.free_pp
+    usual = [pp, pp, priors.aspect_std > 0, k1, k1 and zoom_range >= options.zoom_for_c1]
+    drift = pp and priors.pp_drift_std > 0
+    return np.array([*usual, k1 and priors.k2_std > 0, drift, drift] if priors.wide else usual)

@@ -185,8 +185,7 @@ def _displacement(
 ) -> tuple[Array, Array, Array, Array]:
     """Of some edges: residuals (E, 2, m), pose Jacobian (E, 8, 2, m), what a read-out as long as a frame moves in b
     (E, 2, m), and speed in b (E, m), px a frame."""
-    lens = solution.lens
-    shared = np.array([[*lens.pp_px, np.log(lens.aspect), lens.c0, lens.c1]])
+    shared = solution.lens.shared(packed.log_f_pp)[None]
     state = State(np.nan_to_num(solution.log_f, nan=7.0)[None], np.nan_to_num(solution.R)[None], shared)
     with np.errstate(all="ignore"):
         rx, ry, J = residuals(packed, state, part, jacobian=True, pose_only=True)

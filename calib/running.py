@@ -130,6 +130,7 @@ class RunningCalibrator:
             aspect=self.priors.aspect,
             c0=self.priors.c0_mean,
             c1=self.priors.c1_mean,
+            k2=self.priors.k2_mean,
         )
 
     @property
@@ -317,9 +318,8 @@ class RunningCalibrator:
         packed = pack(graph)
         if packed.dof.sum() < 8:
             return None
-        lens = self.lens
         poses = [self._poses.get(f) or self._recent[f] for f in others]
-        shared = np.array([[*lens.pp_px, math.log(lens.aspect), lens.c0, lens.c1]])
+        shared = self.lens.shared(packed.log_f_pp)[None]
         row = len(others)
         first = packed.ia == row
         loss = AdaptiveLoss(packed.dof, self.options.refine.huber)
@@ -353,7 +353,7 @@ class RunningCalibrator:
             step = step / max(1.0, abs(step[0]) / 0.3, float(np.abs(step[1:]).max()) / 0.2)
             move = np.zeros((1, row + 1, 4))
             move[0, row] = step
-            state = state.moved(move, np.zeros((1, 5)))
+            state = state.moved(move, np.zeros_like(shared))
             if settled:
                 break
             lin = linearise(packed, state, loss, pose_only=True)

@@ -1,7 +1,8 @@
 """Levenberg-Marquardt over a batch of starts: assemble, damp, step, accept or reject, stop.
 
-Unknowns: 4 per frame (log f, left rotation increment) and the free ones of 5 shared. Below DENSE_BELOW pose unknowns
-the normal matrix is dense (one Cholesky per start); above, block-sparse frames with a bordered Schur complement.
+Unknowns: 4 per frame (log f, left rotation increment) and the free ones of the shared 5 (8: the wider lens). Below
+DENSE_BELOW pose unknowns the normal matrix is dense (one Cholesky per start); above, block-sparse frames with a
+bordered Schur complement.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from calib.camera import N_SHARED
 from calib.problem import Linearised, Loss, Packed, PriorTerms, State, linearise
 from calib.selected_inverse import DenseCovariance, SelectedCovariance
 
@@ -27,7 +27,10 @@ MAX_ROTATION_STEP = 0.3
 
 
 class Layout:
-    """Which unknown is where: 4 n pose entries, then 5 shared; `active` (4 n + 5,) False = held (gauge, fixed lens)."""
+    """Which unknown is where: 4 n pose entries, then s = 5 or 8 shared; `active` (4 n + s,) False = held (gauge, lens).
+
+    free_shared (s,): which of the shared ones move.
+    """
 
     def __init__(
         self,
@@ -37,7 +40,8 @@ class Layout:
         held: NDArray[np.bool_] | None = None,
     ) -> None:
         n = packed.n_frames
-        self.n, self.size = n, 4 * n + N_SHARED
+        self.n, self.n_shared = n, len(free_shared)
+        self.size = 4 * n + self.n_shared
         self.active = np.ones(self.size, bool)
         self.active[4 * reference + 1 : 4 * reference + 4] = False
         self.active[4 * n :] = np.asarray(free_shared, bool)
@@ -45,19 +49,19 @@ class Layout:
             self.active[: 4 * n] &= ~np.repeat(held, 4)
         a = 4 * packed.ia[:, None] + np.arange(4)
         b = 4 * packed.ib[:, None] + np.arange(4)
-        shared = np.broadcast_to(4 * n + np.arange(N_SHARED), (packed.n_edges, N_SHARED))
-        self.columns = np.concatenate([a, b, shared], 1)  # (E, 13)
+        shared = np.broadcast_to(4 * n + np.arange(self.n_shared), (packed.n_edges, self.n_shared))
+        self.columns = np.concatenate([a, b, shared], 1)  # (E, 8 + s)
         self.dense = 4 * n < DENSE_BELOW
         self._gather: sp.csr_array | None = None
         self._pattern: tuple[Any, ...] | None = None
 
     def vector(self, per_edge: Array) -> Array:
-        """Sum of per-edge vectors (S, E, 13) into (S, 4 n + 5)."""
+        """Sum of per-edge vectors (S, E, 8 + s) into (S, 4 n + s)."""
         flat = self.columns.ravel()
         return np.stack([np.bincount(flat, row.ravel(), self.size) for row in per_edge])
 
     def matrices(self, blocks: Array) -> Array:
-        """Sum of per-edge blocks (S, E, 13, 13) into dense (S, N, N)."""
+        """Sum of per-edge blocks (S, E, 8 + s, 8 + s) into dense (S, N, N)."""
         if self._gather is None:
             # float summation through one sparse matrix: much faster than np.add.at, fixed order.
             rows = (self.columns[:, :, None] * self.size + self.columns[:, None, :]).ravel()
@@ -68,7 +72,7 @@ class Layout:
         return np.ascontiguousarray(out.T).reshape(-1, self.size, self.size)
 
     def sparse(self, blocks: Array) -> tuple[sp.csc_array, Array, Array]:
-        """Sums of one start's blocks (E, 13, 13): active poses (p, p) sparse, poses by shared (4 n, 5), shared (5, 5).
+        """Sums of one start's blocks (E, 8 + s, 8 + s): active poses (p, p) sparse, poses by shared (4 n, s), (s, s).
 
         Frame blocks are summed per frame and per pair of frames; where they go in the matrix is worked out once.
         """
@@ -76,19 +80,23 @@ class Layout:
             self._pattern = self._make_pattern()
         ia, ib, swap, slot, n_pairs, place, indices, pointers = self._pattern
         n = self.n
-        diagonal, pair, border = np.empty((n, 4, 4)), np.empty((n_pairs, 4, 4)), np.empty((n, 4, N_SHARED))
+        diagonal, pair, border = (
+            np.empty((n, 4, 4)),
+            np.empty((n_pairs, 4, 4)),
+            np.empty((n, 4, self.n_shared)),
+        )
         coupling = np.where(swap[:, None, None], blocks[:, 4:8, 0:4], blocks[:, 0:4, 4:8])
         for i in range(4):
             for j in range(4):
                 diagonal[:, i, j] = np.bincount(ia, blocks[:, i, j], n)
                 diagonal[:, i, j] += np.bincount(ib, blocks[:, 4 + i, 4 + j], n)
                 pair[:, i, j] = np.bincount(slot, coupling[:, i, j], n_pairs)
-            for j in range(N_SHARED):
+            for j in range(self.n_shared):
                 border[:, i, j] = np.bincount(ia, blocks[:, i, 8 + j], n)
                 border[:, i, j] += np.bincount(ib, blocks[:, 4 + i, 8 + j], n)
         values = np.concatenate([diagonal.ravel(), pair.ravel(), np.swapaxes(pair, 1, 2).ravel()])
         A = sp.csc_array((values[place], indices, pointers), shape=(len(pointers) - 1,) * 2)
-        return A, border.reshape(4 * n, N_SHARED), blocks[:, 8:, 8:].sum(0)
+        return A, border.reshape(4 * n, self.n_shared), blocks[:, 8:, 8:].sum(0)
 
     def _make_pattern(self) -> tuple[Any, ...]:
         n = self.n
@@ -163,11 +171,11 @@ class NormalEquations:
         self.diagonal[0, self.lens] = np.diagonal(self.D)[:k]
 
     def solve(self, start: int, damping: float) -> Array:
-        """Damped step (4 n + 5,) of one start. Raises numpy.linalg.LinAlgError when the matrix is singular."""
+        """Damped step (4 n + s,) of one start. Raises numpy.linalg.LinAlgError when the matrix is singular."""
         return self.solve_for(self.gradient[start], start, damping)
 
     def solve_for(self, right: Array, start: int = 0, damping: float = 0.0) -> Array:
-        """(damped matrix)^-1 right, both (4 n + 5,). Raises numpy.linalg.LinAlgError when the matrix is singular."""
+        """(damped matrix)^-1 right, both (4 n + s,). Raises numpy.linalg.LinAlgError when the matrix is singular."""
         scale = 1 / np.sqrt(np.maximum(self.diagonal[start], 1e-300))
         if self.dense is not None:
             M = self.dense[start] * scale[:, None] * scale[None, :]
@@ -214,14 +222,14 @@ class NormalEquations:
             shape=(4 * n, len(self.poses)),
         )
         k = len(self.lens)
-        border, shared = np.zeros((4 * n, N_SHARED)), np.eye(N_SHARED)
+        border, shared = np.zeros((4 * n, layout.n_shared)), np.eye(layout.n_shared)
         border[np.ix_(self.poses, self.lens - 4 * n)] = self.B[:, :k]
         shared[np.ix_(self.lens - 4 * n, self.lens - 4 * n)] = self.D[:k, :k]
         full = sp.block_array([[spread @ self.A @ spread.T, border], [border.T, shared]]).tocsc()
         return SelectedCovariance(full, layout.active, layout.n, ia, ib, self.mean_weight)
 
     def covariance(self, start: int = 0) -> Array:
-        """Inverse of the undamped matrix, (4 n + 5, 4 n + 5), zero rows for held unknowns: for small n, and tests.
+        """Inverse of the undamped matrix, (4 n + s, 4 n + s), zero rows for held unknowns: for small n, and tests.
 
         Raises numpy.linalg.LinAlgError when singular.
         """

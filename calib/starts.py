@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from calib import linear
+from calib.camera import N_SHARED, N_WIDE
 from calib.edges import find_bad_edges, linked_frames
 from calib.problem import Loss, Packed, PriorTerms, State, linearise, robust_scale, whitened_squares
 from calib.records import Priors, Solution, StartResult
@@ -18,6 +21,32 @@ Array = NDArray[np.float64]
 # Frames: beyond it the starts are tried on some of the frames, the rest is chained on (dense solver).
 SCOUT_ABOVE = 140
 N_SCOUTS = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Beginning:
+    """Where refine() goes on: packed edges, state (one start), accepted edges (E,), free shared columns, loss scale.
+
+    scale (1,); starts: what a multistart found; valid_share: share of the edges with a valid linear focal, NaN without
+    a multistart.
+    """
+
+    packed: Packed
+    state: State
+    ok: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    scale: Array
+    starts: tuple[StartResult, ...] = ()
+    valid_share: float = float("nan")
+
+
+def about_mean(packed: Packed, state: State, mean_log_f: float) -> tuple[Packed, State]:
+    """The same cameras with their principal point given at mean_log_f, where its prior holds (the wider lens only)."""
+    if state.shared.shape[1] == N_SHARED:
+        return packed, state
+    shared = state.shared.copy()
+    shared[:, :2] += shared[:, 6:8] * (mean_log_f - packed.log_f_pp)
+    return replace(packed, log_f_pp=mean_log_f), State(state.log_f, state.R, shared)
 
 
 def multistart_states(
@@ -32,7 +61,9 @@ def multistart_states(
     good = np.flatnonzero(np.isfinite(log_root) & (np.abs(log_root) < np.log(40)))
 
     def shared(k1: Array) -> Array:
-        out = np.zeros((len(k1), 5))
+        out = np.zeros((len(k1), N_WIDE if priors.wide else N_SHARED))
+        if priors.wide:
+            out[:, N_SHARED] = priors.k2_mean
         out[:, :2], out[:, 2], out[:, 3], out[:, 4] = pp, np.log(priors.aspect), k1, priors.c1_mean
         if not options.distortion:
             out[:, 3] = priors.c0_mean
@@ -87,8 +118,8 @@ def _distinct(cost: Array, mean_log_f: Array, c0: Array) -> NDArray[np.int64]:
 
 def from_scratch(
     packed: Packed, reference: int, frames: NDArray[np.int64], prior_args: tuple, options: RefineOptions
-) -> tuple[State, NDArray[np.bool_], NDArray[np.bool_], tuple[StartResult, ...], float, Array] | None:
-    """Best state (S = 1), accepted edges, free columns, starts, valid share, loss scale; None: nothing is possible."""
+) -> Beginning | None:
+    """The best of many starts, followed to the end; None: nothing is possible."""
     priors, size_px = prior_args
     trusted = linear.consistent_edges(packed, frames)
     linked = linked_frames(packed, trusted, reference)
@@ -98,11 +129,11 @@ def from_scratch(
     names, states, share = multistart_states(packed, tree, reference, priors, options)
     zoom_range = float(np.median(np.ptp(states.log_f, axis=1)))
     free = free_columns(priors, options, zoom_range)
-    terms = PriorTerms(priors, size_px, frames, free)
     coarse = packed.select(trusted).thin(options.thin)
-    layout = Layout(coarse, reference, free)
-
-    # 1. A coarse look: few points an edge, the scale that each start has itself.
+    # 1. A coarse look: few points an edge, the scale that each start has itself; the usual lens (the wider one's other
+    # unknowns stay at their prior means) finds the basin.
+    usual = free & (np.arange(len(free)) < N_SHARED)
+    terms, layout = PriorTerms(priors, size_px, frames, usual), Layout(coarse, reference, usual)
     scale = robust_scale(whitened_squares(coarse, states), coarse.dof)
     result = minimise(
         coarse, layout, terms, states, Loss("huber", scale, options.huber), max_steps=8, tolerance=1e-3
@@ -128,8 +159,8 @@ def from_scratch(
     ok = ~find_bad_edges(e2_leader, packed, options.bad_edge, trusted)
     ok = ok if ok.any() and linked_frames(packed, ok, reference).all() else trusted
     common = Loss("huber", np.full(len(alive), scale[leader]), options.huber)
-    here = result.state.pick(alive)
-    fine = packed.select(ok)
+    packed, here = about_mean(packed, result.state.pick(alive), float(result.state.log_f[leader].mean()))
+    fine, terms = packed.select(ok), PriorTerms(priors, size_px, frames, free)
     layout = Layout(fine, reference, free)
     cost = linearise(fine, here, common).cost + terms.cost(here)
     kept = _distinct(cost, here.log_f.mean(1), here.shared[:, 3])
@@ -166,7 +197,10 @@ def from_scratch(
         )
         for j, k in enumerate(kept)
     )  # fmt: skip
-    return final.state.pick(np.array([best])), ok, free, starts, share, np.array([scale[leader]])
+    return Beginning(
+        packed=packed, state=final.state.pick(np.array([best])), ok=ok, free=free, scale=np.array([scale[leader]]),
+        starts=starts, valid_share=share,
+    )  # fmt: skip
 
 
 def warm(
@@ -176,10 +210,11 @@ def warm(
     start: Solution,
     prior_args: tuple,
     options: RefineOptions,
-) -> tuple[State, NDArray[np.bool_], Array]:
-    """State (S = 1) from a solution, frames missing in it chained on; free columns; loss scale."""
+) -> Beginning:
+    """A solution's cameras, frames missing in it chained on."""
     priors, _ = prior_args
-    state = state_from_solution(packed, frames, start, reference)
+    state = state_from_solution(packed, frames, start, reference, wide=priors.wide)
+    packed, state = about_mean(packed, state, float(state.log_f.mean()))
     free = free_columns(priors, options, float(np.ptp(state.log_f)))
     if not free[4]:
         state.shared[:, 3] += (state.shared[:, 4] - priors.c1_mean) * float(
@@ -188,12 +223,20 @@ def warm(
         state.shared[:, 4] = priors.c1_mean
     if not options.distortion:
         state.shared[:, 3] = priors.c0_mean
+    if priors.wide:  # what is held is held at its prior, whatever the solution had
+        held = ~free & (np.arange(len(free)) >= N_SHARED)
+        state.shared[:, held] = np.array([*np.zeros(N_SHARED), priors.k2_mean, 0.0, 0.0])[held]
     scale = robust_scale(whitened_squares(packed, state), packed.dof)
-    return state, free, scale
+    return Beginning(packed=packed, state=state, ok=np.ones(packed.n_edges, bool), free=free, scale=scale)
 
 
-def state_from_solution(packed: Packed, frames: NDArray[np.int64], start: Solution, reference: int) -> State:
-    """State (S = 1) of a packed graph's frames: known cameras taken over, the others chained from them."""
+def state_from_solution(
+    packed: Packed, frames: NDArray[np.int64], start: Solution, reference: int, *, wide: bool | None = None
+) -> State:
+    """State (S = 1) of a packed graph's frames: known cameras taken over, the others chained from them.
+
+    wide: whether with the wider lens' unknowns (None: as the solution's lens has them).
+    """
     n = packed.n_frames
     log_f, R = np.full((1, n), np.nan), np.full((1, n, 3, 3), np.nan)
     rows = {frame: k for k, frame in enumerate(start.frames.tolist())}
@@ -211,14 +254,14 @@ def state_from_solution(packed: Packed, frames: NDArray[np.int64], start: Soluti
         used = np.array(sorted({step.edge for step in tree}), int)
         H = np.full((1, packed.n_edges, 3, 3), np.nan)
         if len(used):
-            H[:, used] = linear.ideal_homographies(packed.select(used), k1, lens.pp_px, lens.aspect)
+            pp = lens.pp(np.mean(log_f[0, known]) + packed.log_width)
+            H[:, used] = linear.ideal_homographies(packed.select(used), k1, pp, lens.aspect)
         linear.chain(tree, np.where(np.isfinite(H), H, np.eye(3)), log_f, R)
     lost = ~(np.isfinite(log_f[0]) & np.isfinite(R[0]).all((-1, -2)))
     log_f[0, lost], R[0, lost] = np.mean(log_f[0, known]), np.eye(3)
     if np.isfinite(R[0, reference]).all():
         R = R @ R[:, [reference]].swapaxes(-1, -2)
-    shared = np.array([[*lens.pp_px, np.log(lens.aspect), lens.c0, lens.c1]])
-    return State(log_f + packed.log_width, R, shared)
+    return State(log_f + packed.log_width, R, lens.shared(packed.log_f_pp, wide=wide)[None])
 
 
 def scouts(packed: Packed, row: int) -> NDArray[np.int64]:

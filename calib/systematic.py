@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.covariance import edge_statistics
-from calib.problem import Loss, Packed, State, pack, residuals, whitened_squares
+from calib.problem import Loss, Packed, pack, residuals, state_of, whitened_squares
 from calib.records import HomographyGraph, Solution
 from calib.refine import RefineOptions, refine
 
@@ -31,10 +31,7 @@ def _residual_fields(solution: Solution, graph: HomographyGraph) -> tuple[Packed
     if not edges:
         return None
     packed = pack(graph, edges)
-    shared = np.array(
-        [[*solution.lens.pp_px, np.log(solution.lens.aspect), solution.lens.c0, solution.lens.c1]]
-    )
-    state = State(solution.log_f[None], solution.R[None], shared)
+    state = state_of(packed, solution)
     loss = Loss("huber", np.array([max(1.0, np.sqrt(solution.chi2_dof))]))
     with np.errstate(all="ignore"):
         _, _, smooth, _ = edge_statistics(packed, state, loss)
