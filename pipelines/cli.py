@@ -75,13 +75,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except _UsageProblem as error:
         message = error.format_message() if hasattr(error, "format_message") else str(error)
         if message:  # empty: help was asked for by giving nothing, and has been shown
-            one_line = " ".join(message.split())
-            cure = "see broadcast-mosaic --help"
-            return _fail(
-                f"{one_line} {cure}",
-                {"kind": "usage", "what": "arguments", "cause": one_line, "cure": cure},
-                as_json,
-            )
+            cause, cure = _plain(message), f"see {_asked(plain)} --help"
+            what = {"kind": "usage", "what": "arguments", "cause": cause, "cure": cure}
+            return _fail(f"{cause}{' ' if cause.endswith('?') else '; '}{cure}", what, as_json)
         return EXIT_USAGE
     except (KeyboardInterrupt, typer.Abort):
         code = EXIT_INTERRUPTED
@@ -90,6 +86,19 @@ def main(args: Sequence[str] | None = None) -> int:
         what = {"kind": "interrupted", "what": "run", "cause": "interrupted", "cure": cure}
         return _fail(f"interrupted; {cure}", what, as_json, EXIT_INTERRUPTED)
     return int(code or EXIT_OK)
+
+
+def _plain(message: str) -> str:
+    """A usage error on one line, without the words that the libraries put before and around what we say."""
+    words = " ".join(message.split()).removeprefix("Invalid value: ").replace(": Value error, ", ": ")
+    return words.rstrip(".")
+
+
+def _asked(plain: Sequence[str]) -> str:
+    """The command that the arguments begin with, as it is typed: its --help lists what it takes."""
+    first = next((word for word in plain if not word.startswith("-")), "")
+    known = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
+    return f"broadcast-mosaic {first}" if first in known else "broadcast-mosaic"
 
 
 def _fail(line: str, error: Mapping[str, str], as_json: bool, code: int = EXIT_USAGE) -> int:
@@ -289,7 +298,9 @@ def _report(result: RunResult, as_json: bool, quiet: bool) -> int:
 @app.command("probe")
 def _probe(
     context: typer.Context,
-    clip: Path,
+    clip: Annotated[
+        Path, typer.Argument(help="As for `run`: a video file, a folder of images, a pattern, or -.")
+    ],
     shots: Annotated[
         bool,
         typer.Option(

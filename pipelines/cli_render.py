@@ -57,15 +57,14 @@ class Space(StrEnum):
     pitch = "pitch"
 
 
-EPILOG = """
-stabilised: every frame as the shot's reference frame sees it, or along the smoothed path (--to smooth).
-
-overlay: a picture put into the scene, players in front of it. --image board.png --at 120 --corners "610,400 700,402
-705,440 612,438": top left, top right, bottom right, bottom left, in px of frame 120; with --in panorama px of
-panorama.tif, with --in pan-tilt degrees, with --in pitch metres (and --clicks as for the command pitch).
-
-move: keyframes (CSV or JSON: time_s, pan_deg, tilt_deg, hfov_deg, roll_deg) over the panorama, without the clip.
-"""
+# A line break in a paragraph would be kept by typer, wherever the terminal's width wraps the words.
+EPILOG = (
+    "stabilised: every frame as the shot's reference frame sees it, or along the smoothed path (--to smooth).\n\n"
+    'overlay: a picture put into the scene, players in front of it. --image board.png --at 120 --corners "610,400 '
+    '700,402 705,440 612,438": top left, top right, bottom right, bottom left, in px of frame 120; with --in panorama '
+    "px of panorama.tif, with --in pan-tilt degrees, with --in pitch metres (and --clicks, as for `pitch`).\n\n"
+    "move: keyframes (CSV or JSON: time_s, pan_deg, tilt_deg, hfov_deg, roll_deg) over the panorama, without the clip."
+)
 
 
 def render(

@@ -20,7 +20,8 @@ Out = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, errors too.")]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Nothing but errors.")]
 
-FORMAT_HELP = "\n\n".join(f"{entry.name}: {entry.what}" for entry in FORMATS)
+# One line break: typer shows it as one, and two as an empty line.
+FORMAT_HELP = "\n".join(f"{entry.name}: {entry.what}" for entry in FORMATS)
 
 
 def register(app: typer.Typer) -> None:

@@ -267,3 +267,21 @@ def test_progress_shows_stage_count_and_rate_on_a_terminal(
 def test_errors_stay_on_one_line_whatever_the_file_is_called() -> None:
     error = UserError("two\nlines\x1b[31m.mp4", "no such file", "check the path")
     assert str(error) == "two\\nlines\\x1b[31m.mp4: no such file; check the path"
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["export", "out", "--to", "vrml"], "no export is called 'vrml'"),
+        (["render", "out", "--what", "dance"], "Invalid value for '--what': 'dance' is not one of"),
+        (["run", "a.mp4"], "Missing option '-o'"),
+        (["rays", "out", "--frame", "5"], "--frame needs --pixel X,Y"),
+    ],
+)
+def test_wrong_usage_is_one_clean_line_that_names_the_command(
+    args: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(args) == 2
+    line = one_line(capsys.readouterr().err)
+    assert line.startswith(f"broadcast-mosaic: {said}")
+    assert line.endswith(f"; see broadcast-mosaic {args[0]} --help") and "Value error" not in line
