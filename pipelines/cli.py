@@ -6,6 +6,7 @@ Nothing heavy is imported before a command needs it: --help answers without torc
 
 from __future__ import annotations
 
+import io
 import logging
 import re
 import sys
@@ -68,6 +69,9 @@ def main(args: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if args is None else args)
     plain, dotted = _split_settings(given)
     as_json = "--json" in plain
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A terminal without the sign for "plus or minus", or a file name that is no text, must not end an hour's run.
+        sys.stdout.reconfigure(errors="replace")
     try:
         code = app(args=plain, prog_name="broadcast-mosaic", standalone_mode=False, obj=dotted)
     except UserError as error:

@@ -9,6 +9,7 @@ import importlib
 import os
 import platform
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -49,6 +50,9 @@ PROGRAMS = (
     ("nona", "renders panorama.pto (Hugin)", "the package hugin-tools"),
     ("exiftool", "shows the panorama's GPano data", "the package libimage-exiftool-perl"),
 )
+# Encoders by what `render --codec` calls them.
+ENCODERS = (("libx264", "h264"), ("libx265", "hevc10"), ("prores_ks", "prores"))
+SIGNS = "±°×"  # in tables and messages; a terminal that lacks one shows a question mark
 SCRATCH_GIB = 2.0  # a long shot's scratch files: keyframes and frame store
 
 
@@ -72,6 +76,7 @@ def examine() -> list[Finding]:
         ("gpu", gpu),
         ("threads", threads),
         ("optional", optional),
+        ("fonts", fonts),
         ("folders", folders),
     )
     findings: list[Finding] = []
@@ -151,14 +156,14 @@ def encoders() -> Iterator[Finding]:
     """What `render` writes with."""
     import av
 
-    try:
-        av.codec.Codec("libx264", "w")
-        yield Finding(group="codecs", name="libx264", found="encoder, for render")
-    except ValueError:  # PyAV's UnknownCodecError is one
-        cure = "pip install --upgrade av"
-        yield Finding(
-            group="codecs", name="libx264", found="no encoder, for render", state="missing", cure=cure
-        )
+    for name, codec in ENCODERS:
+        use = f"for render --codec {codec}"
+        try:
+            av.codec.Codec(name, "w")
+            yield Finding(group="codecs", name=name, found=f"encoder, {use}")
+        except ValueError:  # PyAV's UnknownCodecError is one
+            cure = "pip install --upgrade av"
+            yield Finding(group="codecs", name=name, found=f"no encoder, {use}", state="missing", cure=cure)
 
 
 def _names_of(codec: str) -> tuple[str, ...]:
@@ -221,18 +226,33 @@ def optional() -> Iterator[Finding]:
         )
 
 
+def fonts() -> Iterator[Finding]:
+    """Nothing draws letters but the reader's own browser; what is said in signs must be sayable in a terminal."""
+    yield Finding(group="fonts", name="report, viewer", found="the browser's own; none is loaded or shipped")
+    encoding = getattr(sys.stdout, "encoding", None) or "ascii"
+    try:
+        SIGNS.encode(encoding)
+        yield Finding(group="fonts", name="terminal", found=f"{encoding}, which has all signs of the tables")
+    except (UnicodeEncodeError, LookupError):
+        found, cure = f"{encoding}, which lacks {SIGNS}", "set PYTHONIOENCODING=utf-8, or a UTF-8 locale"
+        yield Finding(group="fonts", name="terminal", found=found, state="missing", cure=cure)
+
+
 def folders() -> Iterator[Finding]:
     """Room for scratch files, and whether compiled kernels can be kept between runs."""
-    scratch = tempfile.gettempdir()
-    free = shutil.disk_usage(scratch).free / 2**30
-    enough = free >= SCRATCH_GIB
-    yield Finding(
-        group="folders",
-        name="scratch",
-        found=f"{scratch}, {free:.1f} GiB free",
-        state="ok" if enough else "problem",
-        cure="" if enough else "make room, or set TMPDIR",
-    )
+    for name, folder, use, cure in (
+        ("results", os.getcwd(), "; a run's scratch files lie where its results go", "give -o a larger disk"),
+        ("temporary", tempfile.gettempdir(), "", "make room, or set TMPDIR"),
+    ):
+        free = shutil.disk_usage(folder).free / 2**30
+        enough = free >= SCRATCH_GIB
+        yield Finding(
+            group="folders",
+            name=name,
+            found=f"{folder}, {free:.1f} GiB free{use}",
+            state="ok" if enough else "problem",
+            cure="" if enough else cure,
+        )
     import mosaic
 
     place = os.environ.get("NUMBA_CACHE_DIR") or os.path.dirname(mosaic.__file__)

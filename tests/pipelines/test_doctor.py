@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import metadata
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -32,7 +33,9 @@ def test_a_sound_installation_is_ready(capsys: pytest.CaptureFixture[str]) -> No
     assert document["ok"] is True and document["exit_code"] == 0
     assert found["versions", "numpy"] == metadata.version("numpy")
     assert "decoder" in found["codecs", "h264"] and "no decoder" not in found["codecs", "h264"]
-    assert {group for group, _ in found} == {"versions", "codecs", "gpu", "threads", "optional", "folders"}
+    assert {group for group, _ in found} == {
+        "versions", "codecs", "gpu", "threads", "optional", "fonts", "folders",
+    }  # fmt: skip
     assert int(found["threads", "torch"]) >= 1
 
 
@@ -55,14 +58,16 @@ def test_a_package_that_cannot_be_loaded_is_a_problem_with_a_cure(
 def test_what_render_writes_with_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     import av
 
-    assert by_name(doctor.examine())["codecs", "libx264"].state == "ok"
+    found = by_name(doctor.examine())
+    assert all(found["codecs", name].state == "ok" for name in ("libx264", "libx265", "prores_ks"))
+    assert "hevc10" in found["codecs", "libx265"].found
 
     def unknown(name: str, mode: str) -> None:
         raise ValueError(f"{name}: no such encoder")
 
     monkeypatch.setattr(av.codec, "Codec", unknown)
-    (finding,) = doctor.encoders()
-    assert finding.state == "missing" and finding.cure
+    findings = list(doctor.encoders())
+    assert len(findings) == 3 and all(f.state == "missing" and f.cure for f in findings)
 
 
 def test_two_opencv_builds_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,8 +99,27 @@ def test_a_group_that_fails_does_not_hide_the_others(monkeypatch: pytest.MonkeyP
 
 def test_too_little_room_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**30))
-    found = by_name(list(doctor.folders()))["folders", "scratch"]
-    assert found.state == "problem" and "1.0 GiB free" in found.found and "TMPDIR" in found.cure
+    found = by_name(list(doctor.folders()))
+    for name, cure in (("results", "-o"), ("temporary", "TMPDIR")):
+        finding = found["folders", name]
+        assert finding.state == "problem" and "1.0 GiB free" in finding.found and cure in finding.cure
+
+
+def test_a_terminal_without_the_signs_is_told_and_shows_question_marks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(doctor.sys, "stdout", SimpleNamespace(encoding="ascii"))
+    (terminal,) = (f for f in doctor.fonts() if f.name == "terminal")
+    assert terminal.state == "missing" and "utf-8" in terminal.cure
+    # The commands themselves go on: a clip called so must not end in a traceback.
+    code = "import sys; from pipelines.cli import main; sys.exit(main(sys.argv[1:]))"
+    clip = tmp_path / "3 ± 1.y4m"
+    clip.write_bytes(b"YUV4MPEG2 W32 H32 F25:1 Ip A1:1 C420jpeg\n" + (b"FRAME\n" + bytes(32 * 48)) * 2)
+    done = subprocess.run(
+        [sys.executable, "-c", code, "probe", "--no-shots", str(clip)],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and "3 ? 1.y4m" in done.stdout and "Traceback" not in done.stderr
 
 
 def test_doctor_takes_no_settings(capsys: pytest.CaptureFixture[str]) -> None:
