@@ -28,6 +28,7 @@ from mosaic.views import CompositeOptions, ViewPlan, plan_views
 from pipelines.bridge import CameraPlacement, CameraPose, Rolling, homography_graph, rolling_of
 from pipelines.config import Config
 from pipelines.decode import Frame
+from pipelines.film import chosen, filmed
 from pipelines.keyframe_graph import (
     KeyframeImages,
     KeyframeOptions,
@@ -98,6 +99,7 @@ class CalibratedShot:
     store: FrameStore | None = None  # the panorama's frames, open, where they were asked for
     trail: Trail | None = None  # the panorama with players, where asked for
     explained: RotationFit | None = None  # by a camera that turns and zooms; None: of shots merged into one
+    film: Mapping[int, bytes] = field(default_factory=dict)  # small colour JPEGs of some frames
 
     @property
     def refused(self) -> bool:
@@ -227,11 +229,12 @@ def solve_shot(
         surface, plan = _plan([p for p in placements if p.frame in placeable], config, options)
     store = FrameStore(scratch, tracker.size_px)
     kept = False
+    film: dict[int, bytes] = {}
     try:
         with timings.measure("second pass"):
             planned = set(plan.frames)
             fits = second_pass(
-                frames(),
+                filmed(frames(), chosen([o.frame for o in tracker.observations]), film),
                 Retracker(
                     tracker, approximate, config.registration, tracker.register_options,
                     rolling=rolling_of(result.readout_share, approximate),
@@ -245,7 +248,7 @@ def solve_shot(
             solution = frame_poses(tracker, result, [*fits, *steps], start=approximate)
             explained = rotation_fit(result, solution, steps)
             if explained.refused:
-                return refused(solution, explained, fits)
+                return replace(refused(solution, explained, fits), film=film)
             solution, doubtful = without_doubtful(solution, [*result.fits, *fits])
         with timings.measure("composite"):
             fitting = replace(solution, log_f=np.where(contradicted_frames(solution), np.nan, solution.log_f))
@@ -278,7 +281,7 @@ def solve_shot(
         solution=solution, verdict=verdict, level=head, keyframes=result, graph=_graph(tracker, [*result.fits, *fits]),
         rows=rows, panorama=panorama, no_panorama="" if panorama is not None else "no frame fits its camera",
         timings=timings, fits=tuple(fits), steps=tuple(steps), store=store if kept else None,
-        explained=explained, trail=players,
+        explained=explained, trail=players, film=film,
     )  # fmt: skip
 
 

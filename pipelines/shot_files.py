@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from calib import rotation
@@ -21,6 +20,8 @@ from pipelines.exports.panorama_json import write_panorama_json
 from pipelines.exports.panorama_png import write_panorama_png
 from pipelines.exports.panorama_tiff import write_panorama_tiff
 from pipelines.exports.pto import PtoFrame, write_pto
+from pipelines.film import NAME as FILM
+from pipelines.film import PICTURES, small_jpeg, write_film
 from pipelines.output_folder import OutputFolder
 from pipelines.records import ShotRecord
 from pipelines.shot import CalibratedShot
@@ -28,8 +29,6 @@ from pipelines.table import status_counts
 from pipelines.tracking import ShotTracker
 
 OUTLINES = 200  # frames whose outline the report can draw
-THUMBNAILS = 40  # pictures of a shot in the report's film strip: more than a screen has room for
-THUMBNAIL_PX = 160  # wide; 3 KB each
 
 
 def write_shot(
@@ -39,6 +38,7 @@ def write_shot(
     name = f"shot-{index:03d}"
     files = [f"{name}/pairs.npz"]
     write_arrays(folder.stage(files[0]), pair_arrays(shot))
+    write_film(folder.stage(f"{name}/{FILM}"), shot.film)
     panorama: dict[str, Any] | None = None
     if shot.panorama is not None:
         files += write_panorama(folder, name, shot, config)
@@ -161,18 +161,14 @@ def panorama_facts(panorama: Panorama) -> dict[str, Any]:
 
 
 def thumbnails(tracker: ShotTracker) -> dict[int, bytes]:
-    """Frame -> small gray JPEG of keyframes of the shot, at most THUMBNAILS of them, first and last included."""
+    """Frame -> small gray JPEG of keyframes of the shot, at most PICTURES of them, first and last included.
+
+    For a shot that has no film of its own (film.py): no picture of it was stored in colour.
+    """
     keys = sorted(tracker.keyframes)
-    chosen = np.unique(np.linspace(0, len(keys) - 1, min(len(keys), THUMBNAILS)).round().astype(int))
-    encoded = {}
-    for key in (keys[i] for i in chosen):
-        small = tracker.keyframes[key].small
-        size = (THUMBNAIL_PX, max(1, round(small.shape[0] * THUMBNAIL_PX / small.shape[1])))
-        picture = cv2.resize(small, size, interpolation=cv2.INTER_AREA)
-        good, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 75])
-        if good:
-            encoded[int(key)] = data.tobytes()
-    return encoded
+    chosen = np.unique(np.linspace(0, len(keys) - 1, min(len(keys), PICTURES)).round().astype(int))
+    encoded = {keys[i]: small_jpeg(tracker.keyframes[keys[i]].small) for i in chosen}
+    return {int(key): jpeg for key, jpeg in encoded.items() if jpeg}
 
 
 def write_panorama(

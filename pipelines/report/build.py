@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from pipelines.film import NAME as FILM
+from pipelines.film import read_film
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report import words
 from pipelines.report.graph import registration_graph
@@ -49,10 +51,11 @@ def write_report(
 ) -> Path:
     """Write OUT/report.html by write-then-rename and return its path.
 
-    out: the run's folder; the panorama.jpg of its shots are read from it. thumbnails: frame number to a small JPEG,
-    PNG or WebP. Raises OSError: not writable; ValueError: a thumbnail is none of these, a record is not JSON-ready.
+    out: the run's folder; the panorama.jpg and the film of its shots are read from it. thumbnails: frame number to a
+    small JPEG, PNG or WebP, for shots without a film. Raises OSError: not writable; ValueError: a thumbnail is none
+    of these, a record is not JSON-ready.
     """
-    page = render(out, run, table, thumbnails or {})
+    page = render(out, run, table, with_film(out, run.shots, thumbnails or {}))
     path = out / "report.html"
     part = out / f".report.html.{os.getpid()}.part"
     try:
@@ -114,6 +117,16 @@ def render(out: Path, run: RunRecord, table: CameraTable, thumbnails: Mapping[in
         chart_css=Markup(resources.joinpath("vendor/uPlot.min.css").read_text(encoding="utf-8")),
         chart_js=Markup(resources.joinpath("vendor/uPlot.iife.min.js").read_text(encoding="utf-8")),
     )
+
+
+def with_film(out: Path, shots: Sequence[ShotRecord], thumbnails: Mapping[int, bytes]) -> Mapping[int, bytes]:
+    """The thumbnails, with those of a shot that has a film of its own in colour replaced by it."""
+    shown = dict(thumbnails)
+    for shot in shots:
+        if film := read_film(out / f"shot-{shot.index:03d}" / FILM):
+            inside = range(shot.first_frame, shot.last_frame + 1)
+            shown = {frame: jpeg for frame, jpeg in shown.items() if frame not in inside} | film
+    return shown
 
 
 def script_json(data: Any) -> Markup:
