@@ -25,6 +25,7 @@ from pipelines.report import words
 from pipelines.report.graph import registration_graph
 from pipelines.report.pictures import data_uri, panoramas, thumbnail_uris
 from pipelines.report.series import series_json
+from pipelines.report.verdict import verdict_rows
 
 # What a number of the calibration's verdict says, where its name alone does not (calibration.md 7, in readers' words).
 CALIBRATION_NOTES = {
@@ -101,7 +102,13 @@ def render(out: Path, run: RunRecord, table: CameraTable, thumbnails: Mapping[in
             for name in group["files"]
             if name.endswith("panorama.jpg")
         ],
-        shots=[shot_view(out, shot, table, thumbnails, pictures[shot.index]) for shot in run.shots],
+        shots=[
+            shot_view(
+                out, shot, table, thumbnails, pictures[shot.index], (run.clip.get("size_px") or [None])[0]
+            )
+            for shot in run.shots
+        ],
+        failed=[shot.index for shot in run.shots if shot.status == "failed"],
         statuses=status_counts(table),
         signs=words.STATUS_SIGNS,
         timings=timing_rows(run, len(table)),
@@ -166,6 +173,7 @@ def shot_view(
     table: CameraTable,
     thumbnails: Mapping[int, bytes],
     picture: Mapping[str, Any],
+    width_px: float | None,
 ) -> dict[str, Any]:
     """A shot as the template shows it: words, table cells, verdict rows, panorama."""
     facts = words.shot_facts(table, shot.index)
@@ -191,6 +199,9 @@ def shot_view(
         "tilt": words.range_words(facts.tilt_range_deg, "°"),
         "thumbnail": Markup(data_uri(thumbnails[nearest])) if nearest is not None else "",
         "thumbnail_frame": nearest,
+        "verdict": verdict_rows(
+            shot.calibration, facts.f_range and (facts.f_range[0][0], facts.f_range[1][0]), width_px
+        ),
         "calibration": [
             (key, text, CALIBRATION_NOTES.get(key.rpartition(".")[2], ""))
             for key, text in flat(
@@ -255,4 +266,4 @@ def text_of(value: Any, *, in_percent: bool = False) -> str:
         return f"{shown}, … ({len(value)} in all)" if len(value) > 16 else shown or "none"
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {text_of(inner)}" for key, inner in value.items())
-    return str(value)
+    return str(value) or "none"

@@ -119,6 +119,34 @@ def test_calibration_verdict_timings_and_configuration_are_stated(tmp_path: Path
         assert fact in text, fact
 
 
+def test_verdict_is_said_in_words_before_its_raw_numbers(tmp_path: Path) -> None:
+    """As run.json has them: what the error is made of, the evidence against what is shared, the lens in per cent."""
+    table = fake_table()
+    run = fake_run(table)
+    facts = {
+        "sigma_relative": 0.0403, "s10_px": 0.336, "chi2_dof": 1.006, "rotation_deg": 40.48, "support_rows": 5,
+        "sigma_parts": {"cluster": 0.0045, "signal": 0.0393, "halves": 0.0078, "constant_k": 0.0, "pupil": 0.0,
+                        "systematic_px": 0.132, "constant_k_difference": -0.044},
+        "lens": {"pp_px": [641.2, 321.9], "aspect": 1.0, "k1_half_c0": 0.04, "k1_half_c1": 0.0,
+                 "std": {"pp_x": 0.3, "pp_y": None}},
+        "level": {"observable": False, "sentence": "The pan axis is not known.", "tilt0_deg": None},
+        "rolling_shutter": {"found": True, "share_of_frame": 0.4, "first_row_px": 2.6},
+        "flags": ["aspect_assumed"], "keyframes": [0, 9, 20], "keyframe_pairs": 3, "keyframe_pairs_usable": 2,
+    }  # fmt: skip
+    shots = (dataclasses.replace(run.shots[0], calibration=facts), run.shots[1])
+    text = build(tmp_path, dataclasses.replace(run, shots=shots), table).text
+    said = text[text.index("error of the focal length") : text.index("by their names in run.json")]
+    for words_ in (
+        "4.03 % one sigma, made of errors that all pairs share, such as lens model and parallax: 3.9 %; halves",
+        "noise, from pair to pair: 0.45 %", "0.336 px by how much", "may be 0.13 px", "40.5°", "5 of 5",
+        "3 keyframes, 2 of 3 pairs", "641.2 ± 0.30, 321.9 px", "+4.0 %", "The pan axis is not known.",
+        "40 % of the time between pictures", "the file's, not measured",
+    ):  # fmt: skip
+        assert words_ in said, words_
+    assert "another lens model" not in said, "a part that is nothing is not named"
+    assert "nan" not in said.lower() and "None" not in said
+
+
 def test_page_asks_nobody_for_anything(tmp_path: Path) -> None:
     table = fake_table()
     write_fake_panorama(tmp_path)
@@ -184,7 +212,9 @@ def test_run_without_any_measurement_claims_nothing(tmp_path: Path) -> None:
     page = build(tmp_path, dataclasses.replace(run, shots=shots, complete=False), table)
     assert "0 frames (0.0 %) have a calibrated camera; 50 frames lost." in page.text
     assert "Nothing measured." in page.text and "± " not in page.text
-    assert "This run is not complete." in page.text
+    # All of it failed, and nothing was interrupted: a report is written at a run's end.
+    assert "2 of 2 shots failed (0, 1): their frames have no camera." in page.text
+    assert "interrupted" not in page.text
     assert all(value is None for name in CURVES for value in page.data["columns"][name])
 
 
@@ -192,7 +222,8 @@ def test_clip_without_frames_or_shots_still_gives_a_page(tmp_path: Path) -> None
     full = fake_table(10)
     empty = CameraTable(**{c.name: getattr(full, c.name)[:0] for c in dataclasses.fields(full)})
     run = RunRecord(versions={}, config={}, clip={}, shots=(), timings_s={})
-    assert "Nothing could be measured." in build(tmp_path, run, empty).text
+    text = build(tmp_path, run, empty).text
+    assert "Nothing could be measured." in text and "No shot was found" in text
 
 
 def test_100_000_frames_stay_small_with_extremes_and_gaps(tmp_path: Path) -> None:

@@ -315,7 +315,7 @@
   const paper = (on) => { if (printing !== on) { printing = on; resize(width()); } };
   window.addEventListener("beforeprint", () => paper(true)); window.addEventListener("afterprint", () => paper(false));
   matchMedia("print").addEventListener("change", (event) => paper(event.matches));
-  window.addEventListener("beforeprint", () => document.querySelectorAll("section.shot details").forEach((d) => { d.open = true; }));
+  window.addEventListener("beforeprint", () => document.querySelectorAll("section.shot > details").forEach((d) => { d.open = true; }));
   document.getElementById("cursor").hidden = false;
   drawSwatches(); drawStrip(); drawFilm();
   // report.html#frame=120 opens at that frame, or the nearest one that is drawn.
