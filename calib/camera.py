@@ -58,104 +58,155 @@ def transfer(
     jacobian: bool = True,
     pose_only: bool = False,
 ) -> Transfer:
-    """Raw points of a, (..., m), seen in b.
+    """Raw points of a, (..., m), seen in b, and their derivatives (`Seen.jacobian`)."""
+    seen = Seen(points_x, points_y, log_f_a, log_f_b, R_b_a, shared, width_px, log_f_pp=log_f_pp)
+    return Transfer(seen.x, seen.y, seen.jacobian(pose_only=pose_only) if jacobian else None)
+
+
+class Seen:
+    """Raw points of a, (..., m), seen in b: x, y (..., m) raw px; NaN where behind the camera or folded.
 
     log_f_a, log_f_b: (...,); R_b_a (..., 3, 3); shared (..., 5) = pp_x, pp_y, log aspect, c0, c1, or (..., 8) with k2
-    and the principal point's drift (x, y), px per unit of log f: pp(f) = pp + drift (log f - log_f_pp). The Jacobian's
-    columns: log f_a, left increment of R_a (3), log f_b, left increment of R_b (3), and (not pose_only) the shared.
+    and the principal point's drift (x, y), px per unit of log f: pp(f) = pp + drift (log f - log_f_pp).
+    Keeps what the derivatives are made of, so that they can be asked for once the residuals are known.
     """
-    s2 = (width_px / 2) ** 2
-    ppx, ppy, log_aspect, c0, c1 = (shared[..., k, None] for k in range(5))
-    lam_a, lam_b = log_f_a[..., None], log_f_b[..., None]
-    log_w = np.log(width_px)
-    wide = shared.shape[-1] == N_WIDE
-    k2: Array | float = 0.0
-    ppx_b, ppy_b = ppx, ppy
-    if wide:
-        k2, drift_x, drift_y = (shared[..., k, None] for k in range(N_SHARED, N_WIDE))
-        since_a, since_b = lam_a - log_f_pp, lam_b - log_f_pp
-        ppx_b, ppy_b = ppx + drift_x * since_b, ppy + drift_y * since_b
-        ppx, ppy = ppx + drift_x * since_a, ppy + drift_y * since_a
-    ka, kb = c0 + c1 * (lam_a - log_w), c0 + c1 * (lam_b - log_w)
-    aspect = np.exp(log_aspect)
-    alpha_a, alpha_b = np.exp(lam_a), np.exp(lam_b)
-    beta_a, beta_b = alpha_a / aspect, alpha_b / aspect
 
-    dx, dy = points_x - ppx, points_y - ppy
-    rho_d = np.sqrt((dx * dx + dy * dy) / s2)
-    rho = distortion.undistorted_radius(rho_d, ka, k2)
-    shrink = np.where(rho_d > 1e-9, rho / np.where(rho_d > 1e-9, rho_d, 1.0), 1.0)
-    v1, v2 = dx * shrink / alpha_a, dy * shrink / beta_a
-    R = R_b_a[..., None]  # (..., 3, 3, 1)
-    w1 = R[..., 0, 0, :] * v1 + R[..., 0, 1, :] * v2 + R[..., 0, 2, :]
-    w2 = R[..., 1, 0, :] * v1 + R[..., 1, 1, :] * v2 + R[..., 1, 2, :]
-    w3 = R[..., 2, 0, :] * v1 + R[..., 2, 1, :] * v2 + R[..., 2, 2, :]
-    inv = 1.0 / np.where(w3 > 1e-3, w3, np.nan)
-    q1, q2 = w1 * inv, w2 * inv
-    bx, by = alpha_b * q1, beta_b * q2
-    rho_b2 = (bx * bx + by * by) / s2
-    if wide:
-        g = 1 + rho_b2 * (kb + k2 * rho_b2)
-        g = np.where(rho_b2 < distortion.fold_square(kb, k2), g, np.nan)
-    else:
-        g = 1 + kb * rho_b2
-        g = np.where(1 + 3 * kb * rho_b2 > 0, g, np.nan)
-    out_x, out_y = ppx_b + bx * g, ppy_b + by * g
-    if not jacobian:
-        return Transfer(out_x, out_y, None)
+    def __init__(
+        self,
+        points_x: Array,
+        points_y: Array,
+        log_f_a: Array,
+        log_f_b: Array,
+        R_b_a: Array,
+        shared: Array,
+        width_px: float,
+        *,
+        log_f_pp: float = 0.0,
+    ) -> None:
+        self.R, self.s2 = R_b_a, (width_px / 2) ** 2
+        ppx, ppy, log_aspect, c0, self.c1 = (shared[..., k, None] for k in range(N_SHARED))
+        lam_a, lam_b = log_f_a[..., None], log_f_b[..., None]
+        self.zoom_a, self.zoom_b = lam_a - np.log(width_px), lam_b - np.log(width_px)
+        self.wide = shared.shape[-1] == N_WIDE
+        self.k2: Array | float = 0.0
+        ppx_b, ppy_b = ppx, ppy
+        if self.wide:
+            self.k2, self.drift_x, self.drift_y = (shared[..., k, None] for k in range(N_SHARED, N_WIDE))
+            self.since_a, self.since_b = lam_a - log_f_pp, lam_b - log_f_pp
+            ppx_b, ppy_b = ppx + self.drift_x * self.since_b, ppy + self.drift_y * self.since_b
+            ppx, ppy = ppx + self.drift_x * self.since_a, ppy + self.drift_y * self.since_a
+        self.ka, self.kb = c0 + self.c1 * self.zoom_a, c0 + self.c1 * self.zoom_b
+        aspect = np.exp(log_aspect)
+        self.per_alpha_a, self.per_beta_a = np.exp(-lam_a), np.exp(-lam_a) * aspect
+        self.alpha_b = np.exp(lam_b)
+        self.beta_b = self.alpha_b / aspect
 
-    # D_b = derivative of the distortion at u'; G = D_b A_b dpi/dw; GR = G R.
-    twice = (2 * kb + 4 * k2 * rho_b2) / s2 if wide else 2 * kb / s2
-    d11, d12, d22 = g + twice * bx * bx, twice * bx * by, g + twice * by * by
-    ai, bi = alpha_b * inv, beta_b * inv
-    G11, G12, G21, G22 = d11 * ai, d12 * bi, d12 * ai, d22 * bi
-    G13, G23 = -(G11 * q1 + G12 * q2), -(G21 * q1 + G22 * q2)
-    n_columns = N_POSES if pose_only else N_POSES + shared.shape[-1]
-    J = np.empty((*out_x.shape[:-1], n_columns, 2, out_x.shape[-1]))
-    ra = rho * rho
-    slope_a = 1 + ra * (3 * ka + 5 * k2 * ra) if wide else 1 + 3 * ka * ra
-    radial_a = ra / slope_a
-    # D_a^-1 = (1/g_a)(I - (slope - g_a)/slope n n^T): eigenvalue 1/slope along the radius, 1/g_a across.
-    if wide or not pose_only:
-        ga_inv = 1.0 / (1 + ra * (ka + k2 * ra)) if wide else 1.0 / (1 + ka * ra)
-        ux, uy = dx * shrink, dy * shrink
-        ratio = (2 * ka + 4 * k2 * ra if wide else 2 * ka) / s2 / slope_a
-        i11, i12, i22 = (
-            ga_inv * (1 - ratio * ux * ux),
-            -ga_inv * ratio * ux * uy,
-            ga_inv * (1 - ratio * uy * uy),
-        )
-    for row, (a, b, c) in enumerate(((G11, G12, G13), (G21, G22, G23))):
-        x = a * R[..., 0, 0, :] + b * R[..., 1, 0, :] + c * R[..., 2, 0, :]
-        y = a * R[..., 0, 1, :] + b * R[..., 1, 1, :] + c * R[..., 2, 1, :]
-        z = a * R[..., 0, 2, :] + b * R[..., 1, 2, :] + c * R[..., 2, 2, :]
-        by_f = -(x * v1 + y * v2)
-        by_k_a = by_f * radial_a
-        by_k_b = (bx if row == 0 else by) * rho_b2
-        J[..., 0, row, :] = by_f + c1 * by_k_a
-        J[..., 1, row, :] = y - z * v2
-        J[..., 2, row, :] = z * v1 - x
-        J[..., 3, row, :] = x * v2 - y * v1
-        own = d11 * bx + d12 * by if row == 0 else d12 * bx + d22 * by
-        J[..., 4, row, :] = own + c1 * by_k_b
-        J[..., 5, row, :] = c * w2 - b * w3
-        J[..., 6, row, :] = a * w3 - c * w1
-        J[..., 7, row, :] = b * w1 - a * w2
+        dx, dy = points_x - ppx, points_y - ppy
+        rho_d = np.sqrt((dx * dx + dy * dy) / self.s2)
+        self.rho = distortion.undistorted_radius(rho_d, self.ka, self.k2)
+        shrink = self.rho / np.maximum(rho_d, 1e-12)  # at the centre itself dx and dy are 0
+        self.ux, self.uy = dx * shrink, dy * shrink
+        # Batched products with R are several times faster than sums over its entries.
+        shape = np.broadcast(dx, self.R[..., 0, :1]).shape
+        self.v = (self.ux * self.per_alpha_a, self.uy * self.per_beta_a)
+        ray = np.empty((*shape[:-1], 3, shape[-1]))
+        ray[..., 0, :], ray[..., 1, :], ray[..., 2, :] = *self.v, 1.0
+        self.w = np.moveaxis(self.R @ ray, -2, 0).copy()
+        w1, w2, w3 = self.w
+        self.inv = 1.0 / w3
+        _null(self.inv, w3 <= 1e-3)
+        self.bx, self.by = w1 * self.inv * self.alpha_b, w2 * self.inv * self.beta_b
+        self.rho_b2 = (self.bx * self.bx + self.by * self.by) / self.s2
+        bend = self.rho_b2 * (self.kb + self.k2 * self.rho_b2) if self.wide else self.rho_b2 * self.kb
+        self.g = 1 + bend
+        _null(self.g, self.rho_b2 >= distortion.fold_square(self.kb, self.k2))
+        self.x, self.y = ppx_b + self.bx * self.g, ppy_b + self.by * self.g
+
+    def jacobian(self, left: tuple[Array, Array, Array] | None = None, *, pose_only: bool = False) -> Array:
+        """Derivatives (..., 13 or 16, 2, m) of x and y: by log f_a, left increment of R_a (3), log f_b, left increment
+
+        of R_b (3), and (not pose_only) the shared. left: l11, l12, l22 (..., m) of a symmetric matrix on the left of
+        every point's derivatives: whitened and weighted ones cost hardly more than plain ones.
+        """
+        wide, k2, ka, c1 = self.wide, self.k2, self.ka, self.c1
+        bx, by, g, rho_b2 = self.bx, self.by, self.g, self.rho_b2
+        shape = bx.shape
+
+        def two(first: Array | float, second: Array | float) -> Array:
+            # The two results come first in what follows, so that arithmetic runs over long rows of memory.
+            out = np.empty((2, *shape))
+            out[0], out[1] = first, second
+            return out
+
+        # D_b = derivative of the distortion at u'; G = D_b A_b dpi/dw; GR = G R.
+        twice = (2 * self.kb + 4 * k2 * rho_b2) / self.s2 if wide else 2 * self.kb / self.s2
+        tx, ty = twice * bx, twice * by
+        d11, d12, d22 = g + tx * bx, tx * by, g + ty * by
+        if left is None:
+            unit = (two(1.0, 0.0), two(0.0, 1.0))
+            D, b = (two(d11, d12), two(d12, d22)), two(bx, by)
+        else:
+            l11, l12, l22 = left
+            unit = two(l11, l12), two(l12, l22)
+            D = (
+                two(l11 * d11 + l12 * d12, l12 * d11 + l22 * d12),
+                two(l11 * d12 + l12 * d22, l12 * d12 + l22 * d22),
+            )
+            b = two(l11 * bx + l12 * by, l12 * bx + l22 * by)
+        own = D[0] * bx + D[1] * by
+        a, e, c = D[0] * (self.alpha_b * self.inv), D[1] * (self.beta_b * self.inv), own * -self.inv
+        G = np.empty((*shape[:-1], 3, 2, shape[-1]))
+        for k, part in enumerate((a, e, c)):
+            G[..., k, 0, :], G[..., k, 1, :] = part
+        GR = np.swapaxes(self.R, -1, -2) @ G.reshape(*shape[:-1], 3, -1)
+        x, y, z = np.moveaxis(GR.reshape(G.shape), (-3, -2), (0, 1)).copy()
+        (v1, v2), (w1, w2, w3) = self.v, self.w
+
+        n_columns = N_POSES + (0 if pose_only else N_WIDE if wide else N_SHARED)
+        J = np.empty((*shape[:-1], n_columns, 2, shape[-1]))
+        column = np.moveaxis(J, (-3, -2), (0, 1))
+        ra = self.rho * self.rho
+        slope = 1 + ra * (3 * ka + 5 * k2 * ra) if wide else 1 + 3 * ka * ra
+        # G w = 0, so z = -(x v1 + y v2): what moves with log f_a.
+        by_k_a, by_k_b = z * (ra / slope), b * rho_b2
+        column[0] = z + c1 * by_k_a
+        column[1] = y - z * v2
+        column[2] = z * v1 - x
+        column[3] = x * v2 - y * v1
+        column[4] = own + c1 * by_k_b
+        column[5] = c * w2 - e * w3
+        column[6] = a * w3 - c * w1
+        column[7] = e * w1 - a * w2
         if pose_only and not wide:
-            continue
-        au, av = x / alpha_a, y / beta_a
-        by_pp_a = (-(au * i11 + av * i12), -(au * i12 + av * i22))
+            return J
+        # D_a^-1 = (1/g_a)(I - (slope - g_a)/slope n n^T): eigenvalue 1/slope along the radius, 1/g_a across.
+        per_ga = 1.0 / (1 + ra * (ka + k2 * ra)) if wide else 1.0 / (1 + ka * ra)
+        ratio = per_ga * ((2 * ka + 4 * k2 * ra if wide else 2 * ka) / self.s2) / slope
+        rx, ry = ratio * self.ux, ratio * self.uy
+        i11, i12, i22 = per_ga - rx * self.ux, rx * self.uy, per_ga - ry * self.uy
+        by_pp_a = (
+            y * (i12 * self.per_beta_a) - x * (i11 * self.per_alpha_a),
+            x * (i12 * self.per_alpha_a) - y * (i22 * self.per_beta_a),
+        )
         if wide:  # the principal point of either frame follows its log f
-            J[..., 0, row, :] += drift_x * by_pp_a[0] + drift_y * by_pp_a[1]
-            J[..., 4, row, :] += drift_x if row == 0 else drift_y
-            if pose_only:
-                continue
-            J[..., 13, row, :] = by_k_a * ra + by_k_b * rho_b2
-            for k in (0, 1):
-                J[..., 14 + k, row, :] = since_a * by_pp_a[k] + (since_b if row == k else 0.0)
+            for k, drift in enumerate((self.drift_x, self.drift_y)):
+                column[0] += drift * by_pp_a[k]
+                column[4] += drift * unit[k]
+        if pose_only:
+            return J
         for k in (0, 1):
-            J[..., 8 + k, row, :] = by_pp_a[k] + (1.0 if row == k else 0.0)
-        J[..., 10, row, :] = y * v2 - (d12 if row == 0 else d22) * by
-        J[..., 11, row, :] = by_k_a + by_k_b
-        J[..., 12, row, :] = (lam_a - log_w) * by_k_a + (lam_b - log_w) * by_k_b
-    return Transfer(out_x, out_y, J)
+            column[8 + k] = by_pp_a[k] + unit[k]
+        column[10] = y * v2 - D[1] * by
+        column[11] = by_k_a + by_k_b
+        column[12] = self.zoom_a * by_k_a + self.zoom_b * by_k_b
+        if wide:
+            column[13] = by_k_a * ra + by_k_b * rho_b2
+            for k in (0, 1):
+                column[14 + k] = self.since_a * by_pp_a[k] + self.since_b * unit[k]
+        return J
+
+
+def _null(values: Array, where: Array) -> None:
+    """NaN into some of the values, in place."""
+    if where.any():
+        values[where] = np.nan

@@ -56,7 +56,7 @@ def undistorted_radius(rho_observed: ArrayLike, k1_half: ArrayLike, k2_half: Arr
         bend = k1 * r2 if one else (k1 + k2 * r2) * r2
         valid = (1 + 3 * bend > 0 if one else r2 < fold_square(k1, k2)) & (rho >= 0)
         valid &= np.abs(rho * (1 + bend) - rho_d) <= 1e-9 * (1 + rho_d)
-    return np.where(valid, rho, np.nan)
+    return rho if valid.all() else np.where(valid, rho, np.nan)
 
 
 def distort(

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 Array = NDArray[np.float64]
@@ -32,23 +33,23 @@ def inverse_diagonal_blocks(A: sp.csc_array, band: int) -> Array:
     starts = list(range(0, 4 * n, size))
     stops = [min(s + size, 4 * n) for s in starts]
     A = A.tocsr()
-    T: list[Array] = []
+    T: list[tuple[Array, bool]] = []  # Cholesky factors
     X: list[Array] = []
     for k, (s, e) in enumerate(zip(starts, stops, strict=True)):
         block = A[s:e, s:e].toarray()
         if k:
             U = A[starts[k - 1] : s, s:e].toarray()
-            gain = np.linalg.solve(T[-1], U)
+            gain = cho_solve(T[-1], U, check_finite=False)
             X.append(gain)
             block = block - U.T @ gain
-        T.append(block)
+        T.append(cho_factor(block, lower=True, check_finite=False))
     out = np.zeros((n, 4, 4))
     P: Array = np.zeros((0, 0))
     for k in range(len(starts) - 1, -1, -1):
-        inverse = np.linalg.inv(T[k])
+        inverse = cho_solve(T[k], np.eye(stops[k] - starts[k]), check_finite=False)
         P = np.asarray(inverse if k == len(starts) - 1 else inverse + X[k] @ P @ X[k].T)
-        for j in range((stops[k] - starts[k]) // 4):
-            out[starts[k] // 4 + j] = P[4 * j : 4 * j + 4, 4 * j : 4 * j + 4]
+        frames = np.arange((stops[k] - starts[k]) // 4)
+        out[starts[k] // 4 + frames] = P.reshape(len(frames), 4, len(frames), 4)[frames, :, frames]
     return out
 
 

@@ -78,25 +78,16 @@ class Layout:
         """
         if self._pattern is None:
             self._pattern = self._make_pattern()
-        ia, ib, swap, slot, n_pairs, place, indices, pointers = self._pattern
-        n = self.n
-        diagonal, pair, border = (
-            np.empty((n, 4, 4)),
-            np.empty((n_pairs, 4, 4)),
-            np.empty((n, 4, self.n_shared)),
-        )
+        by_a, by_b, swap, by_pair, place, indices, pointers = self._pattern
+        E, k = blocks.shape[:2]
+        a = (by_a @ blocks[:, 0:4].reshape(E, -1)).reshape(-1, 4, k)
+        b = (by_b @ blocks[:, 4:8].reshape(E, -1)).reshape(-1, 4, k)
+        diagonal, border = a[..., 0:4] + b[..., 4:8], a[..., 8:] + b[..., 8:]
         coupling = np.where(swap[:, None, None], blocks[:, 4:8, 0:4], blocks[:, 0:4, 4:8])
-        for i in range(4):
-            for j in range(4):
-                diagonal[:, i, j] = np.bincount(ia, blocks[:, i, j], n)
-                diagonal[:, i, j] += np.bincount(ib, blocks[:, 4 + i, 4 + j], n)
-                pair[:, i, j] = np.bincount(slot, coupling[:, i, j], n_pairs)
-            for j in range(self.n_shared):
-                border[:, i, j] = np.bincount(ia, blocks[:, i, 8 + j], n)
-                border[:, i, j] += np.bincount(ib, blocks[:, 4 + i, 8 + j], n)
+        pair = (by_pair @ coupling.reshape(E, -1)).reshape(-1, 4, 4)
         values = np.concatenate([diagonal.ravel(), pair.ravel(), np.swapaxes(pair, 1, 2).ravel()])
         A = sp.csc_array((values[place], indices, pointers), shape=(len(pointers) - 1,) * 2)
-        return A, border.reshape(4 * n, self.n_shared), blocks[:, 8:, 8:].sum(0)
+        return A, border.reshape(4 * self.n, self.n_shared), blocks[:, 8:, 8:].sum(0)
 
     def _make_pattern(self) -> tuple[Any, ...]:
         n = self.n
@@ -115,7 +106,12 @@ class Layout:
         part = whole[:, poses].tocsr()[poses].tocsc()
         part.sort_indices()
         place = np.rint(part.data).astype(np.int64) - 1
-        return ia, ib, swap, slot, len(keys), place, part.indices, part.indptr
+
+        def sums(group: NDArray[np.int64], n_groups: int) -> sp.csr_array:
+            edges = np.arange(len(group))
+            return sp.csr_array((np.ones(len(group)), (group, edges)), shape=(n_groups, len(group)))
+
+        return sums(ia, n), sums(ib, n), swap, sums(slot, len(keys)), place, part.indices, part.indptr
 
 
 class NormalEquations:
@@ -296,8 +292,11 @@ def minimise(
     while running.any():
         live = np.flatnonzero(running)
         now = State(log_f[live], R[live], shared[live])
+        these = (
+            live if len(live) < S else slice(None)
+        )  # a slice does not copy what may be hundreds of megabytes
         equations = NormalEquations(
-            layout, priors, now, Linearised(cost[live], blocks[live], gradient[live], e2[live])
+            layout, priors, now, Linearised(cost[these], blocks[these], gradient[these], e2[these])
         )
         pending = list(range(len(live)))
         step = np.zeros((len(live), layout.size))
@@ -327,12 +326,11 @@ def minimise(
             if new_cost[j] <= cost[k]:
                 change = (cost[k] - new_cost[j]) / max(cost[k], 1e-300)
                 log_f[k], R[k], shared[k] = trial.log_f[j], trial.R[j], trial.shared[j]
-                cost[k], blocks[k], gradient[k], e2[k] = (
-                    new_cost[j],
-                    new.blocks[j],
-                    new.gradient[j],
-                    new.e2[j],
-                )
+                cost[k] = new_cost[j]
+                if S == 1:
+                    blocks, gradient, e2 = new.blocks, new.gradient, new.e2
+                else:
+                    blocks[k], gradient[k], e2[k] = new.blocks[j], new.gradient[j], new.e2[j]
                 if change < tolerance and not clamped[j] and damping[k] < 1e-2:
                     running[k], converged[k], stop[k] = False, True, "converged"
                 damping[k] = max(damping[k] * 0.1, 1e-12)
