@@ -203,10 +203,10 @@ def rendering_lines(n_runs: int, say: Callable[[str], None]) -> list[str]:
     sigma = np.hypot(np.sqrt(0.5 / GOLDEN_RUNS), np.sqrt(0.5 / n_runs))
     lines = [
         f"## The paper's algorithm against the rendering in goldens.json, {n_runs} runs a cell", "",
-        f"Ratio of standard deviations; asked: .7 to 1.3. The rendering has {GOLDEN_RUNS} runs (its standard deviations "
-        f"are known to {100 * np.sqrt(0.5 / GOLDEN_RUNS):.0f} %; .5 and 1.0 px are the same draws), so that 95 % of the "
-        f"ratios of equal algorithms lie in {np.exp(-1.96 * sigma):.2f} to {np.exp(1.96 * sigma):.2f}. Last column: our "
-        f"runs in batches of {PAPER_RUNS}, which is what a line of the table above has.", "",
+        f"Ratio of standard deviations; asked: .7 to 1.3. The rendering has {GOLDEN_RUNS} runs (its standard "
+        f"deviations are known to {100 * np.sqrt(0.5 / GOLDEN_RUNS):.0f} %; .5 and 1.0 px are the same draws), so that "
+        f"95 % of the ratios of equal algorithms lie in {np.exp(-1.96 * sigma):.2f} to {np.exp(1.96 * sigma):.2f}. "
+        f"Last column: our runs in batches of {PAPER_RUNS}, which is what a line of the table above has.", "",
         "| table | noise | f0 or alpha0 | f1 or beta0 | x | y | batches of 100 |", "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     ratios = []
