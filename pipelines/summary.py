@@ -26,22 +26,20 @@ def print_summary(out: Path, record: RunRecord) -> None:
     table = Table("shot", "pictures", "status", "focal length px", "zoom", "files", title=escape(str(out)))
     for shot in record.shots:
         counts = ", ".join(f"{n} {status}" for status, n in shot.status_counts.items() if n)
-        status = shot.status if shot.status == "ok" else f"{shot.status}: {shot.reason}"
-        files = ", ".join(Path(name).name for name in shot.files)
         rows = camera.shot == shot.index
         cells = (
             str(shot.index),
             f"{shot.first_frame}-{shot.last_frame} ({counts})",
-            status,
+            shot.status,  # the sentence below the table says why
             focal_range(camera, rows),
             zoom_range(camera, rows),
-            files,
+            file_names(shot.files),
         )
         table.add_row(*(escape(cell) for cell in cells))
     console.print(table)
     for shot in record.shots:
-        if shot.sentence:
-            console.print(escape(f"shot {shot.index}: {shot.sentence}"))
+        if why := shot.sentence or shot.reason.replace("_", " "):
+            console.print(escape(f"shot {shot.index}: {why}"))
     for warning in record.warnings:
         console.print(escape(f"note: {warning}"))
     exports = record.config.get("output", {}).get("exports") or ()
@@ -71,6 +69,17 @@ def print_clips(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         table.add_row(*(escape(cell) for cell in (*cells, row["reason"])))
     console.print(table)
     console.print(escape(f"results: a folder for each clip in {path.parent}, all of them in {path}"))
+
+
+def file_names(files: Sequence[str]) -> str:
+    """'pairs.npz, panorama .tif .jpg': endings gathered, so that a narrow terminal breaks between them."""
+    ends: dict[str, list[str]] = {}
+    for name in files:
+        path = Path(name)
+        ends.setdefault(path.stem, []).append(path.suffix)
+    return ", ".join(
+        f"{stem}{found[0]}" if len(found) == 1 else " ".join([stem, *found]) for stem, found in ends.items()
+    )
 
 
 def export_words(out: Path, record: RunRecord, name: str) -> str:

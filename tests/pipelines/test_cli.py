@@ -285,3 +285,25 @@ def test_wrong_usage_is_one_clean_line_that_names_the_command(
     line = one_line(capsys.readouterr().err)
     assert line.startswith(f"broadcast-mosaic: {said}")
     assert line.endswith(f"; see broadcast-mosaic {args[0]} --help") and "Value error" not in line
+
+
+def test_the_final_table_cuts_no_word_off_in_a_narrow_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipelines import summary
+
+    files = tuple(
+        f"shot-000/{name}" for name in ("pairs.npz", "panorama.tif", "panorama.jpg", "panorama.json")
+    )
+    code = "perspective_signal_below_systematics"
+    shot = shot_record(status="relative", reason=code, sentence="", files=files)
+    with OutputFolder(tmp_path / "out", "digest") as folder:
+        write_camera_csv(folder.stage("camera.csv"), camera_table(10, f_px=np.full(10, np.nan)))
+        folder.publish(run_record((shot,)))
+    monkeypatch.setattr(summary, "WIDTH", 80)
+    summary.print_summary(tmp_path / "out", run_record((shot,)))
+    shown = capsys.readouterr().out
+    assert max(len(line) for line in shown.splitlines() if line[:1] in "┃│") == 80
+    assert "…" not in shown and "relative" in shown
+    assert "shot 0: perspective signal below systematics" in shown
+    assert summary.file_names(files) == "pairs.npz, panorama .tif .jpg .json"
