@@ -15,6 +15,7 @@ from rich.table import Table
 from pipelines.archive import read_camera_csv
 from pipelines.exports.formats import format_named
 from pipelines.records import CameraTable, RunRecord
+from pipelines.report.words import listed_files
 
 WIDTH = 120  # columns where stdout is no terminal and has no width of its own
 
@@ -74,11 +75,12 @@ def print_clips(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def file_names(files: Sequence[str]) -> str:
     """'pairs.npz, panorama .tif .jpg': endings gathered, so that a narrow terminal breaks between them."""
     ends: dict[str, list[str]] = {}
-    for name in files:
+    for name, note in listed_files(files):
         path = Path(name)
-        ends.setdefault(path.stem, []).append(path.suffix)
+        ends.setdefault(path.stem, []).append(path.suffix or f"({note})")
     return ", ".join(
-        f"{stem}{found[0]}" if len(found) == 1 else " ".join([stem, *found]) for stem, found in ends.items()
+        f"{stem}{found[0]}" if len(found) == 1 and found[0].startswith(".") else " ".join([stem, *found])
+        for stem, found in ends.items()
     )
 
 

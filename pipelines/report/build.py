@@ -214,6 +214,7 @@ def shot_view(
         ),
         "panorama": picture,
         "panorama_rows": list(flat({k: v for k, v in (shot.panorama or {}).items() if k != "outlines"})),
+        "files": words.listed_files(shot.files),
         "timings": [(stage, f"{seconds:.2f} s") for stage, seconds in shot.timings_s.items()],
     }
 

@@ -257,6 +257,18 @@ def found(shot: ShotRecord, facts: ShotFacts) -> str:
     return words
 
 
+def listed_files(files: Sequence[str]) -> list[tuple[str, str]]:
+    """(name, note) for a list: files of a shot as they are; of a folder below, as of tiles, its name and how many."""
+    names, inside = [], Counter[str]()
+    for name in files:
+        parts = name.split("/")
+        if len(parts) <= 2:
+            names.append((name, ""))
+        else:
+            inside["/".join(parts[:2]) + "/"] += 1
+    return names + [(folder, plural(count, "file")) for folder, count in inside.items()]
+
+
 def merging(facts: Mapping[str, Any]) -> list[str]:
     """What came of merging shots, a sentence a group and an attempt; nothing where it was not asked for."""
     told = [

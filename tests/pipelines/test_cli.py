@@ -307,3 +307,5 @@ def test_the_final_table_cuts_no_word_off_in_a_narrow_terminal(
     assert "…" not in shown and "relative" in shown
     assert "shot 0: perspective signal below systematics" in shown
     assert summary.file_names(files) == "pairs.npz, panorama .tif .jpg .json"
+    tiles = [f"shot-000/panorama_files/9/{n}_0.jpg" for n in range(40)]
+    assert summary.file_names((*files[:1], *tiles)) == "pairs.npz, panorama_files (40 files)"

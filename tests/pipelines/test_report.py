@@ -147,6 +147,15 @@ def test_verdict_is_said_in_words_before_its_raw_numbers(tmp_path: Path) -> None
     assert "nan" not in said.lower() and "None" not in said
 
 
+def test_tiles_of_a_deep_zoom_panorama_are_one_line(tmp_path: Path) -> None:
+    table = fake_table()
+    run = fake_run(table)
+    tiles = tuple(f"shot-000/panorama_files/9/{n}_0.jpg" for n in range(300))
+    shots = (dataclasses.replace(run.shots[0], files=("shot-000/pairs.npz", *tiles)), run.shots[1])
+    text = build(tmp_path, dataclasses.replace(run, shots=shots), table).text
+    assert "shot-000/panorama_files/ (300 files)" in text and "7_0.jpg" not in text
+
+
 def test_page_asks_nobody_for_anything(tmp_path: Path) -> None:
     table = fake_table()
     write_fake_panorama(tmp_path)
