@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import re
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from pipelines.errors import InputError
 from pipelines.exports.panorama_json import read_surface
 from pipelines.frame_geometry import frame_geometry
 from pipelines.rays import pixel_to_ray, ray_to_pan_tilt, ray_to_pixel
+from pipelines.records import RunRecord
 from pipelines.report.build import clip_line, clip_name
 from pipelines.report.words import STATUS_SIGNS
 from pipelines.serve.tiles import Tiles
@@ -46,6 +47,7 @@ class ServedRun:
                 self.tiles[shot.index] = Tiles(path)
                 self.surfaces[shot.index] = read_surface(path.with_suffix(".json"))
         self.thumbnails = read_thumbnails(out / "report.html")
+        self.files = listed_files(self.run, out)
 
     def close(self) -> None:
         """Let go of the panoramas."""
@@ -155,6 +157,14 @@ def stretches(frames: np.ndarray) -> list[list[int]]:
         return []
     pieces = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
     return [[int(piece[0]), int(piece[-1])] for piece in pieces]
+
+
+def listed_files(run: RunRecord, out: Path) -> dict[str, Path]:
+    """Name, as the report links to it, to file: what the run says it wrote for its shots, inside OUT."""
+    names = {name for shot in run.shots for name in shot.files}
+    names |= {name for group in (run.extra.get("merging") or {}).get("groups", ()) for name in group["files"]}
+    inside = (name for name in names if not PurePosixPath(name).is_absolute())
+    return {name: out / name for name in inside if ".." not in PurePosixPath(name).parts}
 
 
 def read_thumbnails(report: Path) -> dict[int, tuple[str, bytes]]:

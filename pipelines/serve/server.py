@@ -1,22 +1,24 @@
 """The addresses of `serve`, on the loopback interface: a table of patterns, each with what answers it.
 
-A request's path is matched against these patterns and never used as a file name. Requests that name another host are
-refused, so that a page elsewhere cannot read the run through a name that it points at this machine.
+A request's path is matched against these patterns and names, and never used as a file name. Requests that name another
+host are refused, so that a page elsewhere cannot read the run through a name that it points at this machine.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import math
 import re
+import shutil
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from typing import IO, Any
+from urllib.parse import parse_qs, unquote, urlsplit
 
 from pipelines.archive import to_json
 from pipelines.errors import OutputError
@@ -28,9 +30,13 @@ HOST = "127.0.0.1"
 POLICY = "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src {own}; script-src {own}"
 OWN, INLINE = "'self'", "'unsafe-inline'"  # the report holds its scripts itself
 PAGES = {"viewer.js": "text/javascript", "viewer.css": "text/css"}
-FILES = {"camera.csv": "text/csv", "run.json": "application/json"}  # what the report links to
+FILES = {
+    "camera.csv": "text/csv",
+    "run.json": "application/json",
+}  # what the report links to, beside shots' files
+KINDS = {".jpg": "image/jpeg", ".png": "image/png", ".tif": "image/tiff", ".json": "application/json"}
 
-Answer = tuple[HTTPStatus, str, bytes]
+Answer = tuple[HTTPStatus, str, bytes | Path]  # a Path: the file's content, which may be larger than memory
 NOT_FOUND: Answer = (
     HTTPStatus.NOT_FOUND,
     "text/plain; charset=utf-8",
@@ -128,6 +134,9 @@ def answer(run: ServedRun, target: str) -> Answer:
     for name, kind in FILES.items():
         if parts.path == f"/{name}":
             return _file(run.out / name, f"{kind}; charset=utf-8")
+    listed = run.files.get(unquote(parts.path.removeprefix("/")))
+    if listed is not None:
+        return HTTPStatus.OK, KINDS.get(listed.suffix, "application/octet-stream"), listed
     for pattern, function in ROUTES:
         match = pattern.fullmatch(parts.path)
         if match is not None:
@@ -158,6 +167,17 @@ def _file(path: Path, kind: str) -> Answer:
         return NOT_FOUND
 
 
+def _opened(found: Answer) -> tuple[HTTPStatus, str, IO[bytes], int]:
+    """Status, kind, open content and its bytes."""
+    status, kind, body = found
+    if isinstance(body, bytes):
+        return status, kind, io.BytesIO(body), len(body)
+    try:
+        return status, kind, body.open("rb"), body.stat().st_size
+    except OSError:  # gone since the run was opened
+        return _opened(NOT_FOUND)
+
+
 def _resource(name: str) -> bytes:
     return files("pipelines.serve").joinpath("viewer", name).read_bytes()
 
@@ -177,17 +197,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, *, with_body: bool) -> None:
         host = (self.headers.get("Host") or "").rpartition(":")[0] or self.headers.get("Host") or ""
+        found: Answer
         if host not in (HOST, "localhost"):
-            status, kind, body = (
-                HTTPStatus.FORBIDDEN,
-                "text/plain; charset=utf-8",
-                b"This server answers to 127.0.0.1.\n",
-            )
+            found = HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", b"This server answers to 127.0.0.1.\n"
         else:
-            status, kind, body = answer(self.server.run, self.path)
+            found = answer(self.server.run, self.path)
+        status, kind, stream, size = _opened(found)
         self.send_response(status)
         self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Length", str(size))
         own = INLINE if self.path.partition("?")[0] == "/report" else OWN
         self.send_header("Content-Security-Policy", POLICY.format(own=own))
         self.send_header("X-Content-Type-Options", "nosniff")
@@ -197,11 +215,12 @@ class _Handler(BaseHTTPRequestHandler):
             "Cache-Control", "no-store" if kind.startswith(("text/html", "application")) else "no-cache"
         )
         self.end_headers()
-        if with_body:
-            try:
-                self.wfile.write(body)
-            except ConnectionError:
-                log.debug("the browser went away")
+        with stream:
+            if with_body:
+                try:
+                    shutil.copyfileobj(stream, self.wfile)
+                except ConnectionError:
+                    log.debug("the browser went away")
 
     def log_message(self, format: str, *args: Any) -> None:
         log.debug(format, *args)

@@ -143,7 +143,8 @@ def test_only_the_addresses_of_the_table_answer(pan_run: Finished, server: RunSe
     secret.write_text("not for the browser")
     for target in (
         "/../secret.txt", "/..%2fsecret.txt", "/%2e%2e/secret.txt", "/tile/../../secret.txt", "//secret.txt",
-        f"/{secret}", "/report/../../secret.txt", "/shot-000/panorama.tif", "/viewer.js/../viewer.html", "/etc/passwd",
+        f"/{secret}", "/report/../../secret.txt", "/shot-000/rows.npz", "/shot-000/",
+        "/viewer.js/../viewer.html", "/etc/passwd",
         "/camera.csv/", "/camera.csv%00", "/thumbnail/../run.json", "/tile/0/0/-1/0", "/api/point/0",
         "/api/point/9?x=1&y=1",
         "/api/point/0?x=nan&y=1", "/api/point/0?x=inf&y=1", "/api/point/0?x=a&y=1", "/api/frame/0/99999",
@@ -166,6 +167,30 @@ def test_only_the_addresses_of_the_table_answer(pan_run: Finished, server: RunSe
         policy = fetch(server, target)[1]["content-security-policy"]
         assert policy.startswith("default-src 'none'") and "http" not in policy
     assert fetch(server, "/camera.csv")[2] == (pan_run.out / "camera.csv").read_bytes()
+
+
+def test_every_link_of_the_report_leads_somewhere(pan_run: Finished, server: RunServer) -> None:
+    page = fetch(server, "/report")[2].decode()
+    links = {link for link in re.findall(r'<a href="([^"#]+)"', page) if not link.startswith("data:")}
+    assert {"camera.csv", "run.json", "shot-000/pairs.npz", "shot-000/panorama.jpg"} <= links
+    for link in links:
+        status, headers, body = fetch(server, f"/{link}")
+        content = (pan_run.out / link).read_bytes()
+        assert status == 200 and body == content and int(headers["content-length"]) == len(content), link
+    assert fetch(server, "/shot-000/panorama.tif")[1]["content-type"] == "image/tiff"
+
+
+def test_a_run_offers_no_file_outside_its_folder(tmp_path: Path) -> None:
+    """Whatever its run.json claims."""
+    secret = tmp_path / "secret.txt"
+    secret.write_text("not for the browser")
+    out = finished(tmp_path / "out")
+    told = json.loads((out / "run.json").read_text())
+    told["shots"][0]["files"] = ["../secret.txt", str(secret), "shot-000/gone.tif"]
+    (out / "run.json").write_text(json.dumps(told))
+    with serving(out) as server:
+        for target in ("/../secret.txt", "/..%2Fsecret.txt", f"/{secret}", "/shot-000/gone.tif"):
+            assert fetch(server, target)[0] == 404, target
 
 
 def test_the_server_listens_on_loopback_alone(server: RunServer) -> None:
