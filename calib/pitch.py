@@ -173,7 +173,7 @@ def fit_pitch_camera(
         raise ValueError(f"pixels {xy.shape} and points {plane.shape} do not go with {n} cameras")
     needed = 4 if position_m is None else 2
     if n < needed:
-        raise ValueError(f"{n} points, {needed} are needed")
+        raise ValueError(f"{n} {'point' if n == 1 else 'points'}, {needed} are needed")
     if not (click_std_px > 0 and log_focal_std > 0):
         raise ValueError("errors of clicks and focal length must be positive")
     points = np.concatenate([plane, np.zeros((n, 1))], axis=1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipelines.cli_rays import outside_note
 from pipelines.cli_results import AsJson, print_json, refuse_settings
 from pipelines.csv_output import write_csv
 from pipelines.errors import EXIT_OK, EXIT_SHOTS_FAILED, InputError
@@ -66,6 +67,7 @@ def pitch(
     found = fitted(out, clicks, template, camera, click_px)
     import numpy as np
 
+    from pipelines.archive import read_run
     from pipelines.clicks import read_ball
 
     if points is not None:
@@ -88,6 +90,9 @@ def pitch(
             "or in a frame without a camera",
             file=sys.stderr,
         )
+    size_px = read_run(out).clip.get("size_px") if out is not None else None
+    if note := outside_note([row for row in rows if np.isfinite(row["X_m"])], size_px):
+        print(f"broadcast-mosaic: {note}", file=sys.stderr)
     code = EXIT_SHOTS_FAILED if unknown == len(rows) else EXIT_OK
     if as_json:
         print_json({"exit_code": code, "camera": camera_facts(found), "points": rows})

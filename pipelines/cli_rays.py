@@ -63,11 +63,26 @@ def rays(
     code = EXIT_SHOTS_FAILED if unknown and len(unknown) == len(rows) else EXIT_OK
     if unknown:
         print(f"broadcast-mosaic: {_why(table, unknown, len(rows))}", file=sys.stderr)
+    if note := outside_note(rows, run.clip.get("size_px")):
+        print(f"broadcast-mosaic: {note}", file=sys.stderr)
     if as_json:
         print_json({"exit_code": code, "points": rows})
     else:
         write_csv(rows, COLUMNS, path)
     return code
+
+
+def outside_note(rows: Sequence[dict[str, Any]], size_px: Sequence[int] | None) -> str:
+    """A line about pixels that no picture has; '' where there are none. Their rays follow from the lens model alone."""
+    known = [(row["x_px"], row["y_px"]) for row in rows if row["x_px"] is not None]
+    if not size_px:
+        return ""
+    w, h = size_px
+    n = sum(not (-0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5) for x, y in known)
+    if not n:
+        return ""
+    which = "the point lies" if len(rows) == 1 else f"{n} of {len(rows)} points {'lies' if n == 1 else 'lie'}"
+    return f"{which} outside the {w} x {h} picture"
 
 
 def answer(

@@ -94,7 +94,9 @@ def read_move(path: Path) -> KeyedMove:
     else:
         rows = list(read_csv_rows(path, KEY_CURE, encoding="utf-8-sig")[1])
     if len(rows) < 2:
-        raise InputError(path, f"has {len(rows)} keyframes, two are needed", KEY_CURE)
+        raise InputError(
+            path, f"has {len(rows)} keyframe{'' if len(rows) == 1 else 's'}, two are needed", KEY_CURE
+        )
     try:
         values = np.array([[float(row[key]) for key in KEYS] for row in rows])
         roll = np.array([float(row.get("roll_deg") or 0.0) for row in rows])

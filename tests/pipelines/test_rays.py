@@ -198,6 +198,23 @@ def test_command_says_why_there_is_no_answer(tmp_path: Path, capsys: pytest.Capt
     assert "does not see that direction" in one_line(capsys.readouterr().err)
 
 
+def test_command_says_when_a_point_is_in_no_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The numbers are given, for a lens goes on beyond its picture; that nobody saw the point is said."""
+    known = truth()
+    out = str(finished(tmp_path / "out", known))
+    w, h = known.run().clip["size_px"]
+    asked = ["rays", out, "--frame", str(FIRST)]
+    assert cli.main([*asked, "--pixel", f"{w - 1},{h - 1}", "--pixel", "0,0"]) == 0
+    assert capsys.readouterr().err == ""
+    assert cli.main([*asked, "--pixel", f"{w},5", "--pixel", "3,3"]) == 0
+    assert f"1 of 2 points lies outside the {w} x {h} picture" in one_line(capsys.readouterr().err)
+    pan, tilt = ray_to_pan_tilt(known.rays(0, 1))[0]
+    assert cli.main([*asked, "--pan-tilt", f"{pan + 40},{tilt}"]) == 0
+    assert "the point lies outside" in one_line(capsys.readouterr().err)
+
+
 def test_commands_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = str(finished(tmp_path / "out"))
     (tmp_path / "bad.csv").write_text("frame,x\n1,2\n")

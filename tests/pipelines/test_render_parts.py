@@ -269,7 +269,7 @@ def test_a_move_passes_through_its_keyframes_without_overshooting(tmp_path: Path
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("a.csv", "time_s,pan_deg,tilt_deg,hfov_deg\n0,1,2,30\n", "has 1 keyframes"),
+        ("a.csv", "time_s,pan_deg,tilt_deg,hfov_deg\n0,1,2,30\n", "has 1 keyframe,"),
         ("a.csv", "time_s,pan_deg,tilt_deg\n0,1,2\n1,1,2\n", "lacks hfov_deg"),
         ("a.csv", "time_s,pan_deg,tilt_deg,hfov_deg\n0,1,2,30\n0,1,2,30\n", "does not rise"),
         ("a.csv", "time_s,pan_deg,tilt_deg,hfov_deg\n0,1,2,30\n1,x,2,30\n", "is no number"),
