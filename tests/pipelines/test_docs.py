@@ -1,7 +1,7 @@
 """The documentation: the site builds without a warning and asks no other machine; the tour is run as it is written.
 
 The commands that the tour shows are its indented lines that begin with `broadcast-mosaic`; the examples in Python of
-docs/python-api.md are run by test_result.py, those of the tour and of results.md here.
+docs/python-api.md are run by test_result.py, those of tour, formats and results here.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import av
 import pytest
@@ -98,6 +99,29 @@ def test_the_tour_runs_as_it_is_written(
     (example,) = blocks(page, "python")
     exec(compile(example, str(page), "exec"), {})
     assert "ok" in capsys.readouterr().out
+
+
+def test_the_export_examples_run(
+    pan_run: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the guide to the formats: its `export` commands, and the examples that read what they wrote."""
+    page = DOCS / "formats.md"
+    for reader in ("pycolmap", "pandas", "polars", "pyarrow"):
+        pytest.importorskip(reader)
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(pan_run.out, "match")
+    exports = [words for words in commands(page) if words[0] == "export"]
+    assert len(exports) >= 3
+    for words in exports:
+        assert cli.main(words) == 0, words
+    names: dict[str, Any] = {}
+    examples = blocks(page, "python")
+    for example in examples:
+        exec(compile(example, str(page), "exec"), names)
+    assert len(examples) == 3 and "num_cameras" in capsys.readouterr().out
+    known = pan_run.table.f_px > 0
+    assert names["K"][0, 0] == pan_run.table.f_px[known][0]
+    assert len(names["by_frame"]) == len(names["table"]) == len(pan_run.table)
 
 
 def test_the_example_of_the_pitch_runs(
