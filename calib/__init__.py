@@ -20,11 +20,13 @@ from calib.records import (
     Level,
     Priors,
     Solution,
+    StraightLine,
     Verdict,
 )
 from calib.refine import RefineOptions, refine
 from calib.running import CameraEstimate, RunningCalibrator, RunningOptions
 from calib.selfcalibration import calibrate
+from calib.straightness import fit_lines
 
 __all__ = [
     "CalibrateOptions",
@@ -45,9 +47,11 @@ __all__ = [
     "RunningCalibrator",
     "RunningOptions",
     "Solution",
+    "StraightLine",
     "Verdict",
     "calibrate",
     "fit_homography",
+    "fit_lines",
     "fit_pupil",
     "judge",
     "level",

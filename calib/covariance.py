@@ -207,6 +207,9 @@ def _cluster_sigma(
     )
     prior += float((a[0 : 4 * layout.n : 4].mean()) ** 2 * terms.mean_precision)
     prior += float(np.sum(a[4 * terms.known_row] ** 2 * terms.known_precision))
+    for (row, term), (_, line) in zip(terms.line_terms(result.state), terms.lines, strict=True):
+        mine = a[[4 * row, *range(4 * layout.n, layout.size)]]
+        prior += line.weight * float(mine @ term.block[0] @ mine)  # its weight is no smaller error
     formal = float(u @ a)
     data = max(formal - prior, 0.0)
     chi2 = max(chi2_dof, 1.0)

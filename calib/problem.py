@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calib import camera, rotation
 from calib.dlt import square_root_information
+from calib.lines import LineTerm, line_term
 from calib.records import HomographyEdge, HomographyGraph, Priors, Solution
 
 Array = NDArray[np.float64]
@@ -289,10 +290,18 @@ def robust_scale(e2: Array, dof: Array) -> Array:
 
 
 class PriorTerms:
-    """Gaussian priors as additions to cost, normal matrix and gradient; `free` (5,) or (8,): which shared ones move."""
+    """Gaussian priors as additions to cost, normal matrix and gradient; `free` (5,) or (8,): which shared ones move.
+
+    log_f_pp: as in Packed, for straight lines under a principal point that drifts.
+    """
 
     def __init__(
-        self, priors: Priors, size_px: tuple[int, int], frames: NDArray[np.int64], free: NDArray[np.bool_]
+        self,
+        priors: Priors,
+        size_px: tuple[int, int],
+        frames: NDArray[np.int64],
+        free: NDArray[np.bool_],
+        log_f_pp: float = 0.0,
     ) -> None:
         W = size_px[0]
         self.free = np.asarray(free, bool)
@@ -315,11 +324,22 @@ class PriorTerms:
         self.known_row = np.array([k for k, _, _ in known], int)
         self.known_log_f = np.array([v for _, v, _ in known], float)
         self.known_precision = np.array([w for _, _, w in known], float)
+        self.lines = [(rows[line.frame], line) for line in priors.straight_lines if line.frame in rows]
+        self.width_px, self.log_f_pp = float(W), log_f_pp
+
+    def line_terms(self, state: State) -> list[tuple[int, LineTerm]]:
+        """Row of the frame and term of every straight line."""
+        return [
+            (row, line_term(line, state.log_f[:, row], state.shared, self.width_px, self.log_f_pp))
+            for row, line in self.lines
+        ]
 
     def cost(self, state: State) -> Array:
         """Sum of squared prior residuals (S,)."""
         out = np.sum(self.precision * (state.shared - self.mean) ** 2, -1)
         out = out + self.mean_precision * (state.log_f.mean(-1) - self.mean_log_f) ** 2
+        for _, term in self.line_terms(state):
+            out = out + term.cost
         return out + np.sum(
             self.known_precision * (state.log_f[:, self.known_row] - self.known_log_f) ** 2, -1
         )

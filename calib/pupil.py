@@ -129,7 +129,7 @@ def _step(
         packed = replace(packed, log_f_pp=solution.lens.pp_log_f)
     state = state_of(packed, solution)
     free = np.array([solution.lens_std.get(k, 0.0) > 0 for k in SHARED[: state.shared.shape[1]]])
-    terms = PriorTerms(solution.priors, graph.size_px, graph.frames, free)
+    terms = PriorTerms(solution.priors, graph.size_px, graph.frames, free, packed.log_f_pp)
     layout = Layout(packed, solution.index(solution.reference), free)
     loss = Loss("huber", np.array([max(1.0, float(np.sqrt(solution.chi2_dof)))]))
     ratios = np.array([parallax.over_height, parallax.over_stand])

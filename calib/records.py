@@ -164,6 +164,28 @@ class KnownFocal:
     std_px: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StraightLine:
+    """Points (m, 2), m >= 3, raw px, along something straight in the scene as one frame shows it, in any order.
+
+    sigma_px: how far a point may lie off the line as seen, across it. weight: times which it counts against edges whose
+    errors are shared and so do not average out (`straightness.fit_lines` finds it); error bars take it out again.
+    Raises ValueError: shape, not finite, sigma or weight not positive.
+    """
+
+    frame: int
+    points_px: Array
+    sigma_px: float = 0.5
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _freeze(self, "points_px", (None, 2))
+        if len(self.points_px) < 3 or not np.isfinite(self.points_px).all():
+            raise ValueError("a straight line needs at least three finite points")
+        if not (self.sigma_px > 0 and self.weight > 0):
+            raise ValueError(f"sigma_px and weight must be positive, got {self.sigma_px} and {self.weight}")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
     """Gaussian knowledge before any picture. Lengths are fractions of the width W, so that they scale with the picture.
@@ -172,6 +194,7 @@ class Priors:
     the parallax of a pupil in front of the pan axis: an effective one (measured on a soccer and a basketball clip).
     c0_std, c1_std: of k1_half(f) = c0 + c1 log(f / W). log_f_mean, log_f_std: of mean log(f / W); weak, it only keeps
     unobservable shots finite. aspect: fx / fy, fixed while aspect_std is 0. known_focals: from the user.
+    straight_lines: seen ones, of which only that they are straight is known; those of other frames do not count.
     k2_mean, k2_std: of the second coefficient of distortion, fixed while its std is 0 (.02 suits a lens that may have
     one). pp_drift_std: of the principal point's drift, per unit of log f (none while 0; 10 / 1920 suits a zoom whose
     centre is seen to move). pp_std_x, pp_std_y then hold at the mean log f of the frames. Take them where the cost of
@@ -190,6 +213,7 @@ class Priors:
     aspect: float = 1.0
     aspect_std: float = 0.0
     known_focals: tuple[KnownFocal, ...] = ()
+    straight_lines: tuple[StraightLine, ...] = ()
     k2_mean: float = 0.0
     k2_std: float = 0.0
     pp_drift_std: float = 0.0

@@ -83,7 +83,7 @@ def refine(
     else:
         begun = warm(packed, row, frames, start, prior_args, options)
     packed, free = begun.packed, begun.free
-    terms = PriorTerms(priors, graph.size_px, frames, free)
+    terms = PriorTerms(priors, graph.size_px, frames, free, packed.log_f_pp)
     result, ok, loss = polish(packed, row, terms, begun.state, begun.ok, begun.scale, free, options)
     linked = linked_frames(packed, ok, row)
     if 2 * linked.sum() < packed.n_frames:

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from calib.lines import LineTerm
 from calib.problem import Linearised, Loss, Packed, PriorTerms, State, linearise
 from calib.selected_inverse import DenseCovariance, SelectedCovariance
 
@@ -127,6 +128,11 @@ class NormalEquations:
             priors.known_row, priors.known_log_f, priors.known_precision, strict=True
         ):
             self.gradient[:, 4 * row] += weight * (value - state.log_f[:, row])
+        # Straight lines: terms in log f of a frame and the shared unknowns.
+        lines = priors.line_terms(state)
+        for row, term in lines:
+            self.gradient[:, 4 * row] += term.gradient[:, 0]
+            self.gradient[:, 4 * n :] += term.gradient[:, 1:]
         self.gradient[:, ~layout.active] = 0.0
         self.extra = np.zeros(N)
         self.extra[4 * n :] = priors.precision
@@ -135,6 +141,9 @@ class NormalEquations:
         if layout.dense:
             A = layout.matrices(lin.blocks)
             A[:, np.arange(N), np.arange(N)] += self.extra
+            for row, term in lines:
+                place = np.array([4 * row, *range(4 * n, N)])
+                A[:, place[:, None], place[None, :]] += term.block
             lam = np.arange(0, 4 * n, 4)
             A[:, lam[:, None], lam[None, :]] += self.mean_weight
             held = ~layout.active
@@ -145,14 +154,18 @@ class NormalEquations:
             self.diagonal = np.diagonal(A, axis1=1, axis2=2).copy()
         else:
             self.dense = None
-            self._sparse(lin)
+            self._sparse(lin, lines)
 
-    def _sparse(self, lin: Linearised) -> None:
+    def _sparse(self, lin: Linearised, lines: list[tuple[int, LineTerm]]) -> None:
         layout = self.layout
         n, N = layout.n, layout.size
         keep = np.flatnonzero(layout.active)
         self.poses, self.lens = keep[keep < 4 * n], keep[keep >= 4 * n]
         A, border, shared = layout.sparse(lin.blocks[0])
+        for row, term in lines:
+            self.extra[4 * row] += term.block[0, 0, 0]
+            border[4 * row] += term.block[0, 0, 1:]
+            shared += term.block[0, 1:, 1:]
         self.A = (A + sp.diags_array(self.extra[self.poses])).tocsc()
         shared = shared + np.diag(self.extra[4 * n :])
         u = (self.poses % 4 == 0).astype(float)[:, None]

@@ -133,7 +133,8 @@ def from_scratch(
     # 1. A coarse look: few points an edge, the scale that each start has itself; the usual lens (the wider one's other
     # unknowns stay at their prior means) finds the basin.
     usual = free & (np.arange(len(free)) < N_SHARED)
-    terms, layout = PriorTerms(priors, size_px, frames, usual), Layout(coarse, reference, usual)
+    terms = PriorTerms(priors, size_px, frames, usual, packed.log_f_pp)
+    layout = Layout(coarse, reference, usual)
     scale = robust_scale(whitened_squares(coarse, states), coarse.dof)
     result = minimise(
         coarse, layout, terms, states, Loss("huber", scale, options.huber), max_steps=8, tolerance=1e-3
@@ -160,7 +161,7 @@ def from_scratch(
     ok = ok if ok.any() and linked_frames(packed, ok, reference).all() else trusted
     common = Loss("huber", np.full(len(alive), scale[leader]), options.huber)
     packed, here = about_mean(packed, result.state.pick(alive), float(result.state.log_f[leader].mean()))
-    fine, terms = packed.select(ok), PriorTerms(priors, size_px, frames, free)
+    fine, terms = packed.select(ok), PriorTerms(priors, size_px, frames, free, packed.log_f_pp)
     layout = Layout(fine, reference, free)
     cost = linearise(fine, here, common).cost + terms.cost(here)
     kept = _distinct(cost, here.log_f.mean(1), here.shared[:, 3])

@@ -75,6 +75,8 @@ def shared_px(solution: Solution, graph: HomographyGraph) -> float:
     mean = np.sum(motion_px * weight[..., None], 1) / total[:, None]
     _, _, axes = np.linalg.svd(mean, full_matrices=False)
     along = mean @ axes[0] / W  # (E,) signed motion along the shot's main direction, widths
+    if not np.any(along):
+        return 0.0  # nothing moved at all: there is no field in proportion to motion
     design = basis * along[:, None, None]
     fields = []
     for part in (slice(0, None, 2), slice(1, None, 2)):
@@ -85,7 +87,7 @@ def shared_px(solution: Solution, graph: HomographyGraph) -> float:
         fields.append(design @ np.linalg.solve(normal, (D * w[:, None]).T @ field[part].reshape(-1, 2)))
     product = np.sum(np.sum(fields[0] * fields[1], -1) * weight, 1) / total
     # All edges tell the strength, each scales it by its own motion: one noisy edge does not decide.
-    strength = float(np.sum(product * total) / np.sum(along**2 * total)) if np.any(along) else 0.0
+    strength = float(np.sum(product * total) / np.sum(along**2 * total))
     return float(np.sqrt(max(strength, 0.0)) * np.max(np.abs(along)))
 
 
