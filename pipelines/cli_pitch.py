@@ -23,8 +23,21 @@ Clicked = Annotated[
     Path | None,
     typer.Option("--clicks", help="CSV: frame, x_px, y_px and X_m, Y_m, or point (a template's name)."),
 ]
+
+
+def complete_templates(incomplete: str) -> list[str]:
+    """Shell completion of a template's name."""
+    from pipelines.pitch_templates import TEMPLATES
+
+    return [name for name in TEMPLATES if name.startswith(incomplete)]
+
+
 Template = Annotated[
-    str, typer.Option(help="football, basketball, american-football; football:100x64 for its size.")
+    str,
+    typer.Option(
+        help="football, basketball, american-football; football:100x64 for its size.",
+        autocompletion=complete_templates,
+    ),
 ]
 Position = Annotated[
     str, typer.Option("--camera", help="X,Y,Z in m of the camera, if known: two clicks are enough then.")
@@ -50,7 +63,9 @@ def pitch(
         Path | None, typer.Option(help="CSV with frame, x_px, y_px of the pixels wanted.")
     ] = None,
     path: Annotated[Path | None, typer.Option("-o", "--out", help="CSV to write; default: stdout.")] = None,
-    list_points: Annotated[str, typer.Option(help="List the points of a template, and stop.")] = "",
+    list_points: Annotated[
+        str, typer.Option(help="List the points of a template, and stop.", autocompletion=complete_templates)
+    ] = "",
     as_json: AsJson = False,
 ) -> int:
     """Where on the pitch a pixel is, in metres with error bars, from four clicked points or more."""

@@ -11,6 +11,20 @@ from pipelines.config import Config
 from pipelines.decode import open_clip
 from pipelines.progress import Progress, silent
 
+# Code points of ITU-T H.273, as FFmpeg's tags have them.
+UNTAGGED = 2
+_COMMON = {
+    1: "BT.709",
+    UNTAGGED: "not tagged",
+    5: "BT.601 (625 lines)",
+    6: "BT.601 (525 lines)",
+    7: "SMPTE 240M",
+}
+MATRICES = {**_COMMON, 0: "RGB", 9: "BT.2020", 10: "BT.2020 constant luminance"}
+PRIMARIES = {**_COMMON, 9: "BT.2020", 11: "DCI-P3", 12: "Display P3"}
+TRANSFERS = {1: "BT.709", UNTAGGED: "not tagged", 4: "gamma 2.2", 5: "gamma 2.8", 6: "BT.601", 7: "SMPTE 240M",
+             8: "linear", 13: "sRGB", 14: "BT.2020", 15: "BT.2020", 16: "PQ", 18: "HLG"}  # fmt: skip
+RANGES = {1: "limited range", 2: "full range"}
 SECONDS = 60.0  # of the clip that are looked at; about as long as that takes on two slow cores at 1080p
 NOT_ASKED = "not_looked_for"
 REASONS = {
@@ -80,7 +94,6 @@ def probe_text(facts: Mapping[str, Any]) -> str:
     rate = "not stated" if fps is None else f"{fps:.6g} frames/s"
     if fps is not None and facts["picture_fps"] != fps:
         rate += f", {facts['picture_fps']:.6g} pictures/s"
-    colour = facts["colour"]
     lines = [
         ("file", f"{facts['path']} ({facts['size_bytes'] / 1e6:.1f} MB, {facts['container']})"),
         ("picture", f"{w}x{h} ({shape})" + (f", turned by {facts['rotation_deg']}°" if facts["rotation_deg"] else "")),
@@ -88,14 +101,26 @@ def probe_text(facts: Mapping[str, Any]) -> str:
         ("rate", rate),
         ("length", _length(facts)),
         ("scan", f"interlaced; deinterlacing: {facts['deinterlace']}" if facts["interlaced"] else "progressive"),
-        ("colour", f"matrix {colour['space']}, range {colour['range']}, primaries {colour['primaries']}, transfer "
-                   f"{colour['transfer']} (2 = not tagged); RGB by {colour['rgb_matrix']}"),
+        ("colour", colour_words(facts["colour"])),
         ("timecode", facts["timecode"] or "none"),
         *_shot_lines(facts["shots"]),
         ("overlays", _overlays(facts["overlays"])),
         *(("note", warning) for warning in facts["warnings"]),
     ]  # fmt: skip
     return "\n".join(f"{name:<9} {value}" for name, value in lines)
+
+
+def colour_words(colour: Mapping[str, Any]) -> str:
+    """'BT.709, limited range' of a clip's tags; each by itself where they differ, and what is assumed for none."""
+    tags = {
+        "matrix": MATRICES.get(colour["space"], f"code {colour['space']}"),
+        "primaries": PRIMARIES.get(colour["primaries"], f"code {colour['primaries']}"),
+        "transfer": TRANSFERS.get(colour["transfer"], f"code {colour['transfer']}"),
+    }
+    alike = len(set(tags.values())) == 1
+    said = next(iter(tags.values())) if alike else ", ".join(f"{name} {word}" for name, word in tags.items())
+    said += f", {RANGES.get(colour['range'], 'range not tagged')}"
+    return said if colour["space"] != UNTAGGED else f"{said}; RGB as by {colour['rgb_matrix']}"
 
 
 def _length(facts: Mapping[str, Any]) -> str:

@@ -133,6 +133,7 @@ def test_doctor_takes_no_settings(capsys: pytest.CaptureFixture[str]) -> None:
         (["exp"], ["export"]),
         (["export", "out", "--to", "colmap,op"], ["colmap,opentrackio", "colmap,opencv"]),
         (["run", "a.mp4", "--exp"], ["--export"]),
+        (["pitch", "out", "--template", "f"], ["football"]),
     ],
 )
 def test_the_shell_completes_commands_options_and_formats(words: list[str], expected: list[str]) -> None:

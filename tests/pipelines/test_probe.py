@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pipelines import cli
-from pipelines.probe import REASONS, probe, probe_text
+from pipelines.probe import REASONS, colour_words, probe, probe_text
 from tests.pipelines.clips import write_clip
 
 SIZE = (320, 192)
@@ -103,3 +103,23 @@ def test_progress_is_told(clip: Path) -> None:
     told: list[tuple[str, int, int | None]] = []
     probe(clip, seconds=0.4, progress=lambda *now: told.append(now))
     assert told == [("first look", i, 10) for i in range(1, 11)]
+
+
+@pytest.mark.parametrize(
+    ("space", "primaries", "transfer", "levels", "said"),
+    [
+        (1, 1, 1, 1, "BT.709, limited range"),
+        (9, 9, 16, 1, "matrix BT.2020, primaries BT.2020, transfer PQ, limited range"),
+        (2, 2, 2, 0, "not tagged, range not tagged; RGB as by ITU601"),
+        (6, 77, 1, 2, "matrix BT.601 (525 lines), primaries code 77, transfer BT.709, full range"),
+    ],
+)
+def test_colour_is_said_by_name(space: int, primaries: int, transfer: int, levels: int, said: str) -> None:
+    tags = {
+        "space": space,
+        "primaries": primaries,
+        "transfer": transfer,
+        "range": levels,
+        "rgb_matrix": "ITU601",
+    }
+    assert colour_words(tags) == said
