@@ -23,7 +23,7 @@ from pipelines.film import read_film
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report import words
 from pipelines.report.graph import registration_graph
-from pipelines.report.pictures import data_uri, panoramas, thumbnail_uris
+from pipelines.report.pictures import NO_PANORAMA, data_uri, panoramas, thumbnail_uris
 from pipelines.report.series import series_json
 from pipelines.report.verdict import verdict_rows
 
@@ -215,6 +215,8 @@ def shot_view(
         "panorama": picture,
         "panorama_rows": list(flat({k: v for k, v in (shot.panorama or {}).items() if k != "outlines"})),
         "files": words.listed_files(shot.files),
+        # Said above, in the panorama's place.
+        "warnings": [w for w in shot.warnings if "uri" in picture or not w.startswith(NO_PANORAMA)],
         "timings": [(stage, f"{seconds:.2f} s") for stage, seconds in shot.timings_s.items()],
     }
 

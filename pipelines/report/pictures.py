@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 from pipelines.records import ShotRecord
 
 MAX_SIDE_PX = 4096
+NO_PANORAMA = "no panorama: "  # what such a warning begins with
 PANORAMA_BYTES = 5_000_000  # of JPEG, 6.7 MB as base64: the page stays under 15 MB
 THUMBNAIL_BYTES = 1_000_000
 MAX_OUTLINES = 3000  # frames over all shots; the nearest one to the cursor is drawn
@@ -43,12 +44,18 @@ def panoramas(out: Path, shots: Sequence[ShotRecord]) -> dict[int, dict[str, Any
     for shot in shots:
         entry = encoded[shot.index]
         if "jpeg" not in entry:
-            entry["why"] = str((shot.panorama or {}).get("reason") or entry["why"])
+            entry["why"] = str((shot.panorama or {}).get("reason") or stated_reason(shot) or entry["why"])
             continue
         entry["uri"] = data_uri(entry.pop("jpeg"))
         entry["href"] = files[shot.index].relative_to(out).as_posix()
         entry["outlines"] = scaled_outlines(shot, entry, every)
     return encoded
+
+
+def stated_reason(shot: ShotRecord) -> str:
+    """Why the run made no panorama, from its warning; '' where it has none."""
+    said = (warning for warning in shot.warnings if warning.startswith(NO_PANORAMA))
+    return next(said, "").removeprefix(NO_PANORAMA)
 
 
 def panorama_file(out: Path, shot: ShotRecord) -> Path:

@@ -56,13 +56,15 @@ def _error(calibration: Mapping[str, Any]) -> Iterator[Row]:
     parts = calibration.get("sigma_parts") or {}
     shares = [(name, _known(parts.get(name))) for name in PARTS]
     made_of = sorted(((s, name) for name, s in shares if s is not None and s >= 5e-5), reverse=True)
-    if total is not None:
-        said = "; ".join(f"{PARTS[name]}: {number(100 * share, 2)} %" for share, name in made_of)
-        yield (
-            "error of the focal length",
-            f"{number(100 * total)} %",
-            f"one sigma, made of {said}" if said else "one sigma",
-        )
+    if total is None:
+        return
+    claimed = calibration.get("claims_focal", True)
+    name = "error of the focal length" if claimed else "error that a focal length would have"
+    if total > 1:
+        yield name, "above 100 %", "nothing is known of it"
+        return
+    said = "; ".join(f"{PARTS[part]}: {number(100 * share, 2)} %" for share, part in made_of)
+    yield name, f"{number(100 * total)} %", f"one sigma, made of {said}" if said else "one sigma"
 
 
 def _evidence(calibration: Mapping[str, Any]) -> Iterator[Row]:

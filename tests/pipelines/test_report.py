@@ -147,6 +147,22 @@ def test_verdict_is_said_in_words_before_its_raw_numbers(tmp_path: Path) -> None
     assert "nan" not in said.lower() and "None" not in said
 
 
+def test_a_shot_that_claims_nothing_says_what_its_error_would_be_and_why_it_has_no_panorama(
+    tmp_path: Path,
+) -> None:
+    table = fake_table()
+    run = fake_run(table)
+    for sigma, said in ((0.14, "14.0 % one sigma"), (12.5, "above 100 % nothing is known of it")):
+        lost = dataclasses.replace(
+            run.shots[1], calibration={"claims_focal": False, "sigma_relative": sigma},
+            warnings=("no panorama: the pictures do not hang together", "a gap of 3 frames"),
+        )  # fmt: skip
+        text = build(tmp_path, dataclasses.replace(run, shots=(run.shots[0], lost)), table).text
+        assert f"error that a focal length would have {said}" in text
+        assert "No panorama: the pictures do not hang together." in text
+        assert text.count("do not hang together") == 1 and "a gap of 3 frames" in text
+
+
 def test_tiles_of_a_deep_zoom_panorama_are_one_line(tmp_path: Path) -> None:
     table = fake_table()
     run = fake_run(table)
