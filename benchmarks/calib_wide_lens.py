@@ -109,8 +109,9 @@ def straight_lines(n_tracks: int, noise_px: float = 0.3) -> list[str]:
     lines = [
         "## Straight lines", "",
         "`fit_lines(graph, lines)` calibrates with lines of which only that they are straight is known: 25 points "
-        f"each, {noise_px:g} px, one across the upper and two across the lower part of three frames. They weigh against the "
-        "edges as the edges' total error over their formal one says, since what edges share does not average out.", "",
+        f"each, {noise_px:g} px, one across the upper and two across the lower part of three frames. They weigh "
+        "against the edges as the edges' total error over their formal one says, since what edges share does not "
+        "average out.", "",
         "| tracks | | error % | statistical sigma | total sigma | within two total % | claimed |",
         "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
