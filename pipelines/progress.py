@@ -37,14 +37,14 @@ class TerminalProgress:
     def __enter__(self) -> Self:
         if self._show:
             from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-            from pipelines.progress_rate import RateColumn
+            from pipelines.progress_rate import CountColumn, RateColumn
 
             self._bars = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(),
-                MofNCompleteColumn(),
+                CountColumn(),
                 RateColumn(),
                 TimeRemainingColumn(compact=True, elapsed_when_finished=True),
                 console=Console(stderr=True),
@@ -56,13 +56,20 @@ class TerminalProgress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._bars is not None:
+            for task in self._bars.tasks:
+                # A header may promise more pictures than come: what has ended is not left at 817 of 825.
+                if kind is None and not task.finished:
+                    self._bars.update(task.id, total=task.completed)
             self._bars.stop()
             self._bars = None
 
     def __call__(self, stage: str, done: int, total: int | None) -> None:
         if self._bars is None:
             return
-        if stage not in self._tasks or done < self._done[stage]:  # a stage that comes again is another shot's
+        if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(f"{self._title}{stage}", total=total)
+        elif done < self._done[stage]:
+            # The next shot's, on the same line: a line a shot would fill the terminal, and the newest be cut off.
+            self._bars.reset(self._tasks[stage], total=total)
         self._done[stage] = done
         self._bars.update(self._tasks[stage], completed=done, total=total)

@@ -128,6 +128,8 @@ def solve_shot(
     """
     timings = Timings()
     priors, refine_options = tracker.priors, refine_options_of(config)
+    # A quarter of a run in which no frame goes by: without a line of its own the program would seem to hang.
+    progress("calibration", 0, None)
     with timings.measure("keyframes"):
         templates = {k: key.template for k, key in tracker.keyframes.items()}
         options_k = KeyframeOptions(
@@ -197,6 +199,7 @@ def solve_shot(
             tracker, result, tracker.fits, start=track, error_bars=not config.panorama.enabled
         )
         explained = rotation_fit(result, approximate, steps)
+    progress("calibration", 1, 1)
     if explained.refused:
         return refused(approximate, explained, tracker.fits)
     # Where frames lie relative to each other: the axes of the reference will do.

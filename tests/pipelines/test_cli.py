@@ -259,9 +259,28 @@ def test_progress_shows_stage_count_and_rate_on_a_terminal(
     with TerminalProgress("a.mp4: ") as progress:
         progress("register", 3, 10)
         progress("register", 10, 10)
-        progress("register", 1, None)  # the next shot
     shown = capsys.readouterr()
     assert shown.out == "" and "a.mp4: register" in shown.err and "10/10" in shown.err
+
+
+def test_progress_keeps_a_line_a_stage_and_ends_finished(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forty shots, a header that promised too much, and a stage that counts nothing."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    with TerminalProgress() as progress:
+        for shot in range(40):
+            progress("first pass", 20 * (shot + 1), 825)
+            progress("calibration", 0, None)
+            progress("calibration", 1, 1)
+            for done in (1, 7):
+                progress("second pass", done, 7)
+    last = capsys.readouterr().err.rpartition("first pass")
+    end = last[1] + last[2]
+    assert end.count("second pass") == end.count("calibration") == 1
+    assert "800/800" in end and "7/7" in end and "/825" not in end
+    assert "1/1" not in end
 
 
 def test_errors_stay_on_one_line_whatever_the_file_is_called() -> None:
