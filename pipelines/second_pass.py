@@ -1,4 +1,4 @@
-"""Decode a shot again: each frame registered to the refined keyframes, the plan's pictures kept, what moves found.
+"""Decode a shot again: frames registered to the refined keyframes, the plan's pictures kept, what moves found.
 
 Frames are independent here, so registration runs in threads; pictures are stored in one more thread and judged in
 another, in order. Results come back in the order of the frames: any number of threads gives the same bytes.
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.framestore import FrameStore
-from mosaic.pyramid import build_pyramid
+from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairFit
 from pipelines.decode import Frame
 from pipelines.moving import MovingFinder, Small
@@ -49,7 +49,10 @@ def second_pass(
     wanted = {o.frame for o in observations if o.reason != "duplicate"}
 
     def register(frame: Frame) -> list[PairFit]:
-        pyramid = build_pyramid(frame.gray, n_levels=n_levels, mask=both_masks(mask, stays(frame.index)))
+        @cache  # most frames want none
+        def pyramid() -> Pyramid:
+            return build_pyramid(frame.gray, n_levels=n_levels, mask=both_masks(mask, stays(frame.index)))
+
         return retracker.register(frame.index, pyramid)
 
     def keep(frame: Frame) -> Small | None:

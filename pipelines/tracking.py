@@ -30,7 +30,7 @@ from mosaic.warp import WarpFamily
 from pipelines.bridge import CameraPose, RotationZoomFamily, edge_from_fit, pair_state, pose_from_state
 from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import KeyframeImages, distance_in_widths
-from pipelines.preparation import PreparedFrame, finest_of
+from pipelines.preparation import PreparedFrame, finest_linked, finest_of
 
 log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
@@ -214,6 +214,7 @@ class ShotTracker:
             dst=frame,
             levels=coarse,
             options=self.register_options,
+            route="eight parameters",
         )
         if not fit.usable and not np.array_equal(step, np.eye(3)):
             fit, H_prev = align(
@@ -245,6 +246,7 @@ class ShotTracker:
             dst=frame,
             levels=levels,
             options=self.register_options,
+            route="eight parameters",
         )
         if keyframe.frame == self._previous.frame and key_fit.usable:
             self.fits[-1] = key_fit  # one edge, the finer one
@@ -299,7 +301,8 @@ class ShotTracker:
         if key_pose is None:
             return fit.usable
         guess = pose_from_state(self._pose, state) if fit.usable else predicted
-        levels = (1, 0) if fit.usable else tuple(range(len(pyramid.levels) - 1, -1, -1))
+        fine = tuple(i for i in (1, 0) if i >= finest_linked(self.size_px))
+        levels = fine if fit.usable else tuple(range(len(pyramid.levels) - 1, fine[-1] - 1, -1))
         key_fit, _ = align(
             keyframe.bind(key_pose.log_f, lens),
             pyramid,
