@@ -103,6 +103,7 @@ def main() -> None:
     parser.add_argument("--size", default="")
     parser.add_argument("--frames", type=int, default=0)
     parser.add_argument("--megapixels", type=float, default=60.0, help="of the panorama; small = faster")
+    parser.add_argument("--no-panorama", action="store_true", help="cameras alone")
     parser.add_argument("--out", type=Path, default=None, help="keep clips and runs here")
     arguments = parser.parse_args()
     changes: dict[str, Any] = {}
@@ -110,7 +111,9 @@ def main() -> None:
         changes["width"], changes["height"] = (int(v) for v in arguments.size.split("x"))
     if arguments.frames:
         changes["n_frames"] = arguments.frames
-    config = Config.model_validate({"panorama": {"max_megapixels": arguments.megapixels}})
+    config = Config.model_validate(
+        {"panorama": {"max_megapixels": arguments.megapixels, "enabled": not arguments.no_panorama}}
+    )
     with tempfile.TemporaryDirectory() as scratch:
         folder = arguments.out or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
