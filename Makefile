@@ -14,6 +14,11 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 TYPED := mosaic calib pipelines
 
+# The viewer that a test opens our Deep Zoom tiles with (BSD). npm puts it beside the interpreter; without npm, or without
+# its registry, that one test is skipped.
+OPENSEADRAGON := openseadragon@6.1.1
+VIEWER := .venv/node_modules/.$(OPENSEADRAGON)
+
 .PHONY: demo test lint format clean
 .DEFAULT_GOAL := test
 
@@ -29,7 +34,12 @@ $(STAMP): pyproject.toml
 demo: $(STAMP)
 	$(BIN)/broadcast-mosaic demo -o demo-out
 
-test: lint
+$(VIEWER): | $(STAMP)
+	@if ! command -v npm >/dev/null; then echo "npm is not installed: the test in OpenSeadragon will be skipped"; \
+	elif npm install --prefix .venv --no-save --ignore-scripts --no-audit --no-fund --loglevel=error $(OPENSEADRAGON); then touch $@; \
+	else echo "npm could not install $(OPENSEADRAGON): the test in OpenSeadragon will be skipped"; fi
+
+test: lint $(VIEWER)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 lint: $(STAMP)
