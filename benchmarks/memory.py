@@ -1,4 +1,4 @@
-"""Peak memory of a run against the length of the clip: `python -m benchmarks.memory --seconds 5 30`.
+"""Peak memory and processor time of a run against the clip's length: `python -m benchmarks.memory --seconds 5 30`.
 
 One generator shot that ends where it begins is looped without decoding it, so that a longer clip is a longer shot of
 the same scene (one long shot is the worst case: shots are let go of one by one). Each run is a process of its own.
@@ -58,8 +58,8 @@ def loop(source: Path, target: Path, times: int) -> Path:
     return target
 
 
-def peak_rss_mib(clip: Path, out: Path, options: list[str]) -> tuple[float, float]:
-    """Peak resident memory in MiB and wall seconds of `broadcast-mosaic run`, as the system counted them."""
+def measure_run(clip: Path, out: Path, options: list[str]) -> tuple[float, float, float]:
+    """Peak resident memory in MiB, wall and processor seconds of `broadcast-mosaic run`, as the system counted them."""
     command = [sys.executable, "-m", "pipelines.cli", "run", str(clip), "-o", str(out), "-q", *options]
     started = time.perf_counter()
     process = subprocess.Popen(command)
@@ -67,7 +67,7 @@ def peak_rss_mib(clip: Path, out: Path, options: list[str]) -> tuple[float, floa
     if os.waitstatus_to_exitcode(status) != 0:
         raise SystemExit(f"{' '.join(command)} ended with {os.waitstatus_to_exitcode(status)}")
     unit = 2**20 if sys.platform == "darwin" else 2**10  # ru_maxrss: bytes there, KiB elsewhere
-    return usage.ru_maxrss / unit, time.perf_counter() - started
+    return usage.ru_maxrss / unit, time.perf_counter() - started, usage.ru_utime + usage.ru_stime
 
 
 def main() -> None:
@@ -78,7 +78,10 @@ def main() -> None:
     parser.add_argument("options", nargs="*", help="settings for the runs, after --")
     args = parser.parse_args()
     peaks: dict[int, float] = {}
-    print(f"{'seconds':>8} {'frames':>7} {'shots':>6} {'keyframes':>10} {'peak MiB':>9} {'frames/s':>9}")
+    print(
+        f"{'seconds':>8} {'frames':>7} {'shots':>6} {'keyframes':>10} {'panorama px':>12} {'of frames':>10} "
+        f"{'peak MiB':>9} {'frames/s':>9} {'CPU ms a frame':>15}"
+    )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         source = make_loop(folder / "loop.mp4", args.width)
@@ -86,13 +89,19 @@ def main() -> None:
             turns = max(1, seconds * FPS // LOOP_FRAMES)
             clip = loop(source, folder / f"{seconds}.mp4", turns)
             out = folder / f"out-{seconds}"
-            peak, wall_s = peak_rss_mib(clip, out, args.options)
+            peak, wall_s, processor_s = measure_run(clip, out, args.options)
             record = read_run(out)
             frames = turns * LOOP_FRAMES
             keyframes = sum(len(shot.calibration["keyframes"]) for shot in record.shots)
             peaks[seconds] = peak
+            panoramas = [
+                shot.panorama for shot in record.shots if shot.panorama and "size_px" in shot.panorama
+            ]
+            sizes = " ".join("{}x{}".format(*panorama["size_px"]) for panorama in panoramas) or "-"
+            used = sum(panorama["frames"] for panorama in panoramas)
             print(
-                f"{seconds:8d} {frames:7d} {len(record.shots):6d} {keyframes:10d} {peak:9.0f} {frames / wall_s:9.1f}",
+                f"{seconds:8d} {frames:7d} {len(record.shots):6d} {keyframes:10d} {sizes:>12} {used:10d} {peak:9.0f} "
+                f"{frames / wall_s:9.1f} {1e3 * processor_s / frames:15.1f}",
                 flush=True,
             )
     shortest, longest = peaks[min(peaks)], peaks[max(peaks)]
