@@ -1,12 +1,13 @@
 """Registration against its peers, with known truth: runs pairs, keeps every answer, writes the tables.
 
     python -m benchmarks.registration run --work FOLDER [--quick] [--seeds 1 2] [--sizes 1080p 720p]
-        [--kinds soccer arena grass] [--gaps 1 5 12 30 60] [--fast | --alone]
+        [--kinds soccer arena grass] [--photographs DATA] [--gaps 1 5 12 30 60] [--fast | --alone]
     python -m benchmarks.registration table --work FOLDER [--out docs/registration-cells.md] [--plot X.svg]
 
 `run` appends a line of FOLDER/pairs.jsonl for each pair and skips those that are there: kill it and start it again.
 Methods follow each other on each pair, so a busy machine is busy for all. Slow peers take part in the first seed of
-`soccer` only, the slowest there in the conditions of --quick, 1 and 12 frames apart.
+`soccer` only, the slowest there in the conditions of --quick, 1 and 12 frames apart. --photographs adds clips rendered
+from the panoramas of real grounds in DATA/pano, with the people of DATA/*_mask; hoardings do not scroll in them.
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ import cv2
 import numpy as np
 
 from benchmarks.registration import peers
-from benchmarks.registration.scenes import CONDITIONS, GAPS, KINDS, Pair, corner_error_px, pairs_of_scene
+from benchmarks.registration.scenes import (
+    CONDITIONS,
+    GAPS,
+    KINDS,
+    PHOTOGRAPHS,
+    Pair,
+    corner_error_px,
+    pairs_of_scene,
+)
 from benchmarks.registration.tables import write_tables
 
 QUICK_CONDITIONS = ("clean", "players 25 %", "hoardings", "8 Mbit/s")
@@ -58,11 +67,12 @@ def run(arguments: argparse.Namespace) -> None:
     done = {json.loads(line)["key"] for line in path.read_text().splitlines()} if path.exists() else set()
     conditions = [c for c in CONDITIONS if not arguments.quick or c in QUICK_CONDITIONS]
     gaps = tuple(arguments.gaps)
+    kinds = [*arguments.kinds, *(PHOTOGRAPHS if arguments.photographs else ())]
     warm = True
     for seed in arguments.seeds:
-        for kind in arguments.kinds:
+        for kind in kinds:
             for size in arguments.sizes:
-                for pair in pairs_of_scene(kind, seed, size, conditions, gaps, done):
+                for pair in pairs_of_scene(kind, seed, size, conditions, gaps, done, arguments.photographs):
                     methods = methods_for(pair, arguments)
                     if warm:  # compiles and imports
                         for method in methods.values():
@@ -96,7 +106,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     one.add_argument("--gaps", type=int, nargs="+", default=list(GAPS))
     one.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     one.add_argument("--sizes", nargs="+", default=["1080p", "720p"])
-    one.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
+    one.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
+    one.add_argument("--photographs", type=Path, metavar="DATA", help="folder with pano/ and people")
     two = commands.add_parser("table")
     two.add_argument("--work", type=Path, required=True)
     two.add_argument("--out", type=Path)
