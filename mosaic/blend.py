@@ -69,6 +69,16 @@ def _linear(flat, stride, xi, yi, s, t):  # type: ignore[no-untyped-def]
     return r, g, b
 
 
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _light(x, y, width, height, falloff):  # type: ignore[no-untyped-def]
+    """What undoes the falloff at px (x, y) of a frame, which may lie far outside: there it must be finite only."""
+    half = np.float32(0.5)
+    off_x, off_y = (x - half * np.float32(width - 1)), (y - half * np.float32(height - 1))
+    wide, high = half * np.float32(width), half * np.float32(height)
+    r2 = min(off_x * off_x + off_y * off_y, np.float32(2) * (wide * wide + high * high)) / (wide * wide)
+    return np.exp(-(falloff[0] + falloff[1] * r2) * r2)
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def sample_view(  # type: ignore[no-untyped-def]
     image,
@@ -79,6 +89,7 @@ def sample_view(  # type: ignore[no-untyped-def]
     grid,
     step,
     gain,
+    falloff,
     margin,
     feather,
     cubic,
@@ -93,9 +104,10 @@ def sample_view(  # type: ignore[no-untyped-def]
     that the grid can reach. trust and
     still: uint8 planes over the same frame at any resolution, 255 = the scene at
     rest, nearest pixel taken; a (1, 1) plane holds for the whole frame. grid (rows, columns, 4) float32: frame x, y,
-    vote and weight 0..1 at every `step`-th tile pixel, linear in between. gain (3,) multiplies the channels. A sample
-    nearer than `margin` px to the frame's border, or of trust, still or vote 0, is not seen; from there vote and weight
-    rise over `feather` px, so that no frame edge shows. Both are multiplied by trust / 255 and by still / 255.
+    vote and weight 0..1 at every `step`-th tile pixel, linear in between. gain (3,) multiplies the channels. falloff
+    (2,): the lens's (vignetting.py), divided out, linear between the same points. A sample nearer than `margin` px to
+    the frame's border, or of trust, still or vote 0, is not seen; from there vote and weight rise over `feather` px, so
+    that no frame edge shows. Both are multiplied by trust / 255 and by still / 255.
     Out, uint8: out (3, h, w); out_vote (h, w), 0 = not seen, else at least 1; out_weight (h, w), likewise; fine
     (3, h, w), where given: the sample less out, in 256ths of a grey level, 128 = none.
     Catmull-Rom (cubic) or linear, with float weights (cv2.remap rounds positions to 1/32 px).
@@ -107,6 +119,7 @@ def sample_view(  # type: ignore[no-untyped-def]
     gain_r, gain_g, gain_b = gain[0], gain[1], gain[2]
     zero, one, rounding, full = np.float32(0), np.float32(1), np.float32(0.5), np.float32(255)
     per = one / np.float32(step)
+    lit, dl, l0 = falloff[0] != zero or falloff[1] != zero, zero, one
     trust_x, trust_y = np.float32(trust.shape[1] / width), np.float32(trust.shape[0] / height)
     still_x, still_y = np.float32(still.shape[1] / width), np.float32(still.shape[0] / height)
     for row in range(rows):
@@ -133,6 +146,9 @@ def sample_view(  # type: ignore[no-untyped-def]
                 out_weight[row, left:right] = 0
                 continue
             dx, dy, dc, dw = (x1 - x0) * per, (y1 - y0) * per, (c1 - c0) * per, (w1 - w0) * per
+            if lit:
+                l0 = _light(x0, y0, width, height, falloff)
+                dl = (_light(x1, y1, width, height, falloff) - l0) * per
             for column in range(left, right):
                 u = np.float32(column - left)
                 x, y, c = x0 + dx * u, y0 + dy * u, c0 + dc * u
@@ -155,12 +171,14 @@ def sample_view(  # type: ignore[no-untyped-def]
                     r, g, b = _cubic(flat, stride, xi, yi - top, s, t)
                 else:
                     r, g, b = _linear(flat, stride, xi, yi - top, s, t)
-                out[0, row, column] = np.uint8(min(max(r * gain_r + rounding, zero), full))
-                out[1, row, column] = np.uint8(min(max(g * gain_g + rounding, zero), full))
-                out[2, row, column] = np.uint8(min(max(b * gain_b + rounding, zero), full))
+                light = l0 + dl * u
+                r, g, b = r * (gain_r * light), g * (gain_g * light), b * (gain_b * light)
+                out[0, row, column] = np.uint8(min(max(r + rounding, zero), full))
+                out[1, row, column] = np.uint8(min(max(g + rounding, zero), full))
+                out[2, row, column] = np.uint8(min(max(b + rounding, zero), full))
                 if fine is not None:
                     top_fine, n = np.float32(255), np.float32(256)
-                    for channel, value in ((0, r * gain_r), (1, g * gain_g), (2, b * gain_b)):
+                    for channel, value in ((0, r), (1, g), (2, b)):
                         part = min(max(value, zero), full) + rounding - np.float32(out[channel, row, column])
                         fine[channel, row, column] = np.uint8(min(max(part * n, zero), top_fine))
                 out_vote[row, column] = np.uint8(min(max(c * ramp + rounding, one), full))
@@ -204,16 +222,27 @@ def solve_log_gains(
         normal = -(robust @ share.T).astype(np.float64)
         normal[np.diag_indices(n)] += robust.sum(axis=1, dtype=np.float64) + ridge
         gain = np.linalg.solve(normal, -(robust * (y - colour)).sum(axis=1, dtype=np.float64))
-        adjusted = y + gain[:, None].astype(np.float32)
-        residual = adjusted - (share * adjusted).sum(axis=0)
-        seen = base > 0
-        scale = max(1.4826 * float(np.median(np.abs(residual[seen]))), 0.005)
-        ratio = np.abs(residual) / scale
-        if step < n_steps // 2:
-            robust = base / np.maximum(ratio / 1.5, 1.0)
-        else:
-            robust = base * np.clip(1 - (ratio / 5.0) ** 2, 0.0, 1.0) ** 2
+        robust = gain_weights(y + gain[:, None].astype(np.float32), robust, base, step, n_steps)
     return gain - np.median(gain)
+
+
+def gain_weights(
+    adjusted: NDArray[np.float32],
+    robust: NDArray[np.float32],
+    base: NDArray[np.float32],
+    step: int,
+    n_steps: int,
+) -> NDArray[np.float32]:
+    """Weights (n, p) of the next of n_steps from samples as adjusted by this one: Huber, in the second half Tukey.
+
+    robust, base (n, p): this step's weights, and those that the samples came with."""
+    share = robust / np.maximum(robust.sum(axis=0), 1e-9)
+    residual = adjusted - (share * adjusted).sum(axis=0)
+    scale = max(1.4826 * float(np.median(np.abs(residual[base > 0]))), 0.005)
+    ratio = np.abs(residual) / scale
+    if step < n_steps // 2:
+        return np.asarray(base / np.maximum(ratio / 1.5, 1.0), np.float32)
+    return np.asarray(base * np.clip(1 - (ratio / 5.0) ** 2, 0.0, 1.0) ** 2, np.float32)
 
 
 # --- robust value ------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,7 @@ from mosaic.surface import Placement, Surface
 from mosaic.tile_maps import Scene
 from mosaic.tiles import paint
 from mosaic.views import CompositeOptions, Lattice, ViewPlan, lattice_of, plan_views, rate_views, share_views
+from mosaic.vignetting import N_BLOCKS, NONE, corner, log_falloff, radius_squared, solve_falloff
 
 __all__ = ["Canvas", "CompositeOptions", "FrameStore", "Panorama", "ViewPlan", "composite", "plan_views"]
 
@@ -37,7 +38,8 @@ class Panorama:
     image (h, w, 3) uint8 RGB; alpha (h, w) uint8, 0 where nothing was seen, else 255. n_seen (h, w) uint8: views
     that saw the pixel. spread (h, w) uint8: 1.4826 times the median distance of the views from the value, in grey
     levels (0 where fewer than 3 views). frames: those used. placements: of every frame of the shot, by number.
-    gains (len(frames), 3): what each frame's channels were multiplied by. deep (h, w, 3) uint16 of 0..65535: image
+    gains (len(frames), 3): what each frame's channels were multiplied by. falloff (2,): a, b of the lens's
+    (vignetting.py), zeros where none was found. deep (h, w, 3) uint16 of 0..65535: image
     with more than 8 bits, where the frames have them.
     """
 
@@ -49,6 +51,7 @@ class Panorama:
     frames: tuple[int, ...]
     placements: Mapping[int, Placement]
     gains: NDArray[np.float64]
+    falloff: NDArray[np.float64] = field(default_factory=lambda: NONE)
     deep: NDArray[np.uint16] | None = None
     canvas: Canvas | None = field(default=None, repr=False)
 
@@ -101,10 +104,10 @@ def composite(
     ]
     lattice = lattice_of(surface)
     views, floor, vote = _final_views(stored, lattice, surface, options)
-    gains = solve_gains(store, views, surface) if options.gains else np.ones((len(views), 3))
+    light = solve_light(store, views, surface) if options.gains else Light(np.ones((len(views), 3)), NONE)
     scene = Scene(
-        surface=surface, store=store, views=views, gains=gains.astype(np.float32), lattice=lattice,
-        floor=floor.reshape(vote.shape[1:]), vote=vote, options=options,
+        surface=surface, store=store, views=views, gains=light.gains.astype(np.float32),
+        falloff=light.falloff, lattice=lattice, floor=floor.reshape(vote.shape[1:]), vote=vote, options=options,
         still=tuple(store.still(p.frame) for p in views),
     )  # fmt: skip
     if options.motion_rounds > 0:
@@ -119,7 +122,8 @@ def composite(
         canvas.release()
     return Panorama(
         image=layers.image, alpha=alpha, surface=surface, n_seen=layers.n_seen, spread=layers.spread,
-        frames=tuple(p.frame for p in views), placements=by_frame, gains=gains, deep=layers.deep, canvas=canvas,
+        frames=tuple(p.frame for p in views), placements=by_frame, gains=light.gains, falloff=light.falloff,
+        deep=layers.deep, canvas=canvas,
     )  # fmt: skip
 
 
@@ -137,19 +141,29 @@ def _final_views(
     return tuple(stored), rating.floor, vote
 
 
-def solve_gains(
-    store: FrameStore, views: Sequence[Placement], surface: Surface, n_points: int = 3000
-) -> NDArray[np.float64]:
-    """Gain per frame and channel (n, 3) so that the views agree, from the coarse pictures; median 1.
+class Light(NamedTuple):
+    """gains (n, 3) per frame and channel, median 1; falloff (2,) of the lens, see vignetting.py."""
 
-    Dark (below 8) and burnt (above 247) blocks are left out: there a gain does not act as a factor.
+    gains: NDArray[np.float64]
+    falloff: NDArray[np.float64]
+
+
+def solve_light(
+    store: FrameStore, views: Sequence[Placement], surface: Surface, n_points: int = 3000
+) -> Light:
+    """What makes the views agree, from the coarse pictures.
+
+    Dark (below 8) and burnt (above 247) blocks are left out: there a gain does not act as a factor. The falloff is
+    the same for all channels.
     """
     lattice = lattice_of(surface, n_points)
     samples = np.zeros((3, len(views), len(lattice.rays)), np.float32)
-    weight = np.zeros((len(views), len(lattice.rays)), np.float32)
+    weight = np.zeros(samples.shape[1:], np.float32)
+    r2 = np.zeros(samples.shape[1:])
     for row, placement in enumerate(views):
         picture, trust = store.coarse(placement.frame)
-        at = (placement.ray_to_pixel(lattice.rays) - (COARSE - 1) / 2) / COARSE
+        xy = placement.ray_to_pixel(lattice.rays)
+        at = (xy - (COARSE - 1) / 2) / COARSE
         height, width = trust.shape
         with np.errstate(invalid="ignore"):
             inside = ((at >= 0) & (at <= [width - 1.001, height - 1.001])).all(axis=-1)
@@ -159,8 +173,13 @@ def solve_gains(
         usable = sure * ((value > 8) & (value < 247)).all(axis=-1)
         samples[:, row, inside] = np.log(np.maximum(value, 1.0)).T
         weight[row, inside] = usable
+        r2[row, inside] = radius_squared(xy[inside], placement.size_px)
+    n_columns = len(lattice.x_px)
+    block = np.arange(len(lattice.rays)) % n_columns * N_BLOCKS // n_columns
+    falloff = solve_falloff(samples.mean(axis=0), weight, r2, block, corner(views[0].size_px))
+    samples -= log_falloff(falloff, r2).astype(np.float32)
     gains: list[Any] = [np.exp(solve_log_gains(channel, weight)) for channel in samples]
-    return np.stack(gains, axis=1)
+    return Light(np.stack(gains, axis=1), falloff)
 
 
 def _coarse_samples(

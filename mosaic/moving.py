@@ -25,6 +25,7 @@ from mosaic.surface import Placement, Surface
 from mosaic.tile_maps import GRID_PX, Scene
 from mosaic.tiles import Layers, paint
 from mosaic.views import CompositeOptions, Lattice
+from mosaic.vignetting import log_falloff, radius_squared
 
 SMALL_WIDTH_PX = 320  # frames are compared at about this width
 # Of the composite that they are compared with: some 65 bytes a pixel are held at a time (measured: 950 MiB for the 14.7
@@ -160,7 +161,7 @@ def _compare(
     truth = np.asarray(cv2.remap(layers.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.uint8)
     facts = np.stack([layers.support, layers.n_seen], axis=-1)
     support, n_seen = np.moveaxis(cv2.remap(facts, at[..., 0], at[..., 1], cv2.INTER_NEAREST), -1, 0)
-    frame = _levelled(stored.rgb, scene.gains[index])
+    frame = _levelled(stored.rgb, scene.gains[index], scene.falloff)
     # Fine detail that lies a fraction of a pixel off differs without moving: allow for what a neighbour would explain.
     detail = local_contrast(truth)
     seen = (n_seen > 1) & (cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
@@ -190,10 +191,18 @@ def _compare(
     )
 
 
-def _levelled(rgb: NDArray[np.uint8], gain: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """rgb (h, w, 3) times gain (3,)."""
+def _levelled(
+    rgb: NDArray[np.uint8], gain: NDArray[np.float32], falloff: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """rgb (h, w, 3) times gain (3,), the lens's falloff divided out."""
     table = np.minimum(np.arange(256)[:, None] * gain, 255).astype(np.uint8)
-    return np.asarray(cv2.LUT(rgb, np.ascontiguousarray(table[None])), np.uint8)
+    levelled = np.asarray(cv2.LUT(rgb, np.ascontiguousarray(table[None])), np.uint8)
+    if not falloff.any():
+        return levelled
+    height, width = rgb.shape[:2]
+    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+    light = np.exp(-log_falloff(falloff, radius_squared(xy, (width, height)))).astype(np.float32)
+    return np.asarray(np.minimum(levelled * light[..., None], 255).astype(np.uint8))
 
 
 def _surroundings(layers: Layers) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -25,7 +25,8 @@ TileMap = tuple[int, NDArray[np.float32], int, int]  # view, grid (rows, columns
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """What all tiles share. lattice: points of views.lattice_of, of which floor and vote are tables. still: a plane
+    """What all tiles share. gains (n, 3): of the views; falloff (2,): of the lens (vignetting.py). lattice: points of
+    views.lattice_of, of which floor (ny, nx) and vote (n, ny, nx), 0 = does not count, are tables. still: a plane
     (h, w) uint8 per view over its frame, at any resolution: 255 = at rest, low = something moves there; None = all
     at rest. quiet: (h, w) uint8 over the surface at any resolution, not 0 where all views are known to agree; None =
     nowhere. map_error_px: how far the interpolated map may be from the exact one, in frame px. maps, fillers: where
@@ -35,10 +36,11 @@ class Scene:
     surface: Surface
     store: FrameStore
     views: tuple[Placement, ...]
-    gains: NDArray[np.float32]  # (n, 3)
+    gains: NDArray[np.float32]
+    falloff: NDArray[np.float64]
     lattice: Lattice
-    floor: NDArray[np.float64]  # (ny, nx)
-    vote: NDArray[np.float32]  # (n, ny, nx), 0 = does not count
+    floor: NDArray[np.float64]
+    vote: NDArray[np.float32]
     options: CompositeOptions
     still: tuple[NDArray[np.uint8], ...] | None = None
     quiet: NDArray[np.uint8] | None = None

@@ -123,9 +123,9 @@ def _blended(
         sample_view(
             rgb, top, high, everywhere if trust is None else trust,
             everywhere if scene.still is None else scene.still[index], grid, step,
-            scene.gains[index] / np.float32(257 if scene.deep else 1), np.float32(max(options.margin_px / shrink, 2.0)),
-            np.float32(max(1.0, options.feather * rgb.shape[1])), cubic,
-            stack[row], vote[row], weight[row], None if fine is None else fine[row],
+            scene.gains[index] / np.float32(257 if scene.deep else 1), scene.falloff.astype(np.float32),
+            np.float32(max(options.margin_px / shrink, 2.0)), np.float32(max(1.0, options.feather * rgb.shape[1])),
+            cubic, stack[row], vote[row], weight[row], None if fine is None else fine[row],
         )  # fmt: skip
     return blend_stack(stack, vote, weight, fine, floor=options.floor, cap=options.cap, doubt=options.doubt)
 

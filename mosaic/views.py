@@ -36,7 +36,7 @@ class CompositeOptions:
     that is not used, and share of its width over which its weight rises. cubic: Catmull-Rom, else linear.
     floor, cap, doubt: grey levels, see blend.robust_value. max_views: most views of one tile (memory).
     threads: tiles worked on at once. memory_bytes: an image larger than this lives in a file in the scratch folder.
-    gains: level the exposure of the views. motion_rounds: rounds of looking
+    gains: level the exposure of the views and the lens's falloff. motion_rounds: rounds of looking
     for what moves (moving.py): each lifts slow players a little more, 3 reach what 6 do within .3 dB; 0 = none.
     quiet_views: views sampled where all agree about what they show (moving.py): 7 to 25 differ by .05 dB there, and
     half of the time goes into sampling.

@@ -11,6 +11,7 @@ import numpy as np
 
 from mosaic.composite import Panorama
 from mosaic.surface import Surface
+from mosaic.vignetting import corner, log_falloff
 from pipelines.exports.whole_file import whole_file
 
 FORMULAS = {
@@ -19,13 +20,15 @@ FORMULAS = {
     "planar": "x = cx + s X / Z, y = cy + s Y / Z",
     "pannini": "x = cx + s q sin(lon), y = cy - s q tan(lat), q = 2 / (1 + cos(lon))",
 }
+FALLOFF = "v(r) = exp(a r^2 + b r^4), r from the frame's middle in half widths; frames are divided by it"
 RAY = "(X, Y, Z) = (cos lat sin lon, -sin lat, cos lat cos lon); x right, y down, z forward"
 
 
 def panorama_facts(
     panorama: Panorama, *, world: str, parallax: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """JSON-ready: projection, size_px, scale_px_per_rad, centre_px, formula, world, parallax, frames, cover.
+    """JSON-ready: projection, size_px, scale_px_per_rad, centre_px, formula, world, parallax, frames, gains_rgb,
+    falloff, cover.
 
     world: what the axes are ('reference camera' or 'levelled: y along the pan axis'). parallax: of the pupil, in these
     axes; None: rays are what every frame sees.
@@ -45,10 +48,21 @@ def panorama_facts(
         "parallax": parallax,
         "frames": [int(k) for k in panorama.frames],
         "gains_rgb": [[round(float(g), 6) for g in row] for row in panorama.gains],
+        "falloff": falloff_facts(panorama),
         "cover": float(seen.mean()),
         "views_median": float(np.median(counts)) if counts.size else 0.0,
         "spread_grey_median": float(np.median(panorama.spread[seen])) if counts.size else 0.0,
     }
+
+
+def falloff_facts(panorama: Panorama) -> dict[str, Any] | None:
+    """The lens's falloff of light and what it leaves in a frame's corner; None where none was found."""
+    if not panorama.falloff.any():
+        return None
+    size_px = panorama.placements[panorama.frames[0]].size_px
+    a, b = (round(float(value), 6) for value in panorama.falloff)
+    left = float(np.exp(log_falloff(panorama.falloff, corner(size_px))))
+    return {"formula": FALLOFF, "a": a, "b": b, "corner": round(left, 4)}
 
 
 def write_panorama_json(

@@ -17,10 +17,15 @@ def world_colour(rays, fine=60.0, height=45.0):
     return 127.5 + height * wave[..., None] + 40 * base
 
 
-def picture(placement, *, fine=60.0, height=45.0, gain=1.0, noise=0.0, seed=0):
-    """What the placement sees, uint8 RGB (h, w, 3)."""
+def picture(placement, *, fine=60.0, height=45.0, gain=1.0, noise=0.0, seed=0, corner_loss=0.0):
+    """What the placement sees, uint8 RGB (h, w, 3); its light falls with r^2, by corner_loss in the corners."""
     xy = np.stack(np.meshgrid(*(np.arange(n) for n in placement.size_px)), axis=-1).astype(float)
     colour = world_colour(placement.pixel_to_ray(xy), fine, height) * gain
+    if corner_loss:
+        off = xy - (np.array(placement.size_px) - 1) / 2
+        colour *= (
+            1 - corner_loss * ((off / off[0, 0]) ** 2 @ (off[0, 0] ** 2 / (off[0, 0] ** 2).sum()))[..., None]
+        )
     colour += np.random.default_rng([seed, placement.frame]).normal(0, noise, colour.shape) if noise else 0
     return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
 

@@ -9,7 +9,18 @@ from mosaic.blend import blend_stack, median_network, sample_view, solve_log_gai
 
 
 def sampled(
-    image, x, y, *, cubic=True, gain=(1, 1, 1), trust=None, still=None, margin=2.0, feather=10.0, step=16
+    image,
+    x,
+    y,
+    *,
+    cubic=True,
+    gain=(1, 1, 1),
+    trust=None,
+    still=None,
+    margin=2.0,
+    feather=10.0,
+    step=16,
+    falloff=(0, 0),
 ):
     """sample_view of a map x(i), y(j) (functions of tile pixels) over a 48 x 32 tile: out, vote, weight."""
     height, width = 32, 48
@@ -23,8 +34,8 @@ def sampled(
     everywhere = np.full((1, 1), 255, np.uint8)
     trust, still = (everywhere if plane is None else plane for plane in (trust, still))
     sample_view(
-        image, 0, image.shape[0], trust, still, grid, step, np.array(gain, np.float32), np.float32(margin),
-        np.float32(feather), cubic, out, seen, weight,
+        image, 0, image.shape[0], trust, still, grid, step, np.array(gain, np.float32),
+        np.array(falloff, np.float32), np.float32(margin), np.float32(feather), cubic, out, seen, weight,
     )  # fmt: skip
     return out, seen, weight
 

@@ -21,7 +21,7 @@ from mosaic.composite import Canvas, Panorama
 from mosaic.surface import KINDS, Surface, choose_surface
 from pipelines.exports.panorama_deepzoom import write_panorama_deepzoom
 from pipelines.exports.panorama_jpeg import gpano_fields, scaled_surface, write_panorama_jpeg
-from pipelines.exports.panorama_json import read_surface, write_panorama_json
+from pipelines.exports.panorama_json import panorama_facts, read_surface, write_panorama_json
 from pipelines.exports.panorama_png import write_panorama_png
 from pipelines.exports.panorama_tiff import halve, write_panorama_tiff
 from pipelines.exports.pto import PtoFrame, hugin_lens, image_line, panorama_line, write_pto
@@ -198,6 +198,16 @@ def test_json_gives_the_same_rays_to_anybody(tmp_path):
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(ValueError, match=r"other\.json"):
         read_surface(tmp_path / "other.json")
+
+
+def test_json_says_the_lenss_falloff():
+    assert panorama_facts(panorama_on(SURFACE), world="levelled")["falloff"] is None
+    lens = Pinhole(size_px=(320, 180))
+    found = replace(panorama_on(SURFACE), falloff=np.array([-0.15, -0.014]), placements={2: lens, 5: lens})
+    facts = panorama_facts(found, world="levelled")["falloff"]
+    r2 = (320**2 + 180**2) / 320**2  # of a corner, in half widths
+    assert facts["corner"] == pytest.approx(np.exp(facts["a"] * r2 + facts["b"] * r2**2), abs=1e-4)
+    assert facts["corner"] == pytest.approx(0.8, abs=0.01)
 
 
 # --- Hugin ---------------------------------------------------------------------------------------------------------
