@@ -191,7 +191,7 @@ def test_no_frame_edge_shows_where_the_camera_model_is_a_little_wrong(tmp_path):
     frames = sweep((-9, 9), n=20, f_px=400.0, size_px=(240, 136))
     surface = choose_surface(frames, "cylindrical")
     x = (np.arange(240) - 119.5) / 120
-    shading = (1 + 0.08 * x**2)[None, :, None]  # what no gain and no lens explains: brighter by 8 % at the sides
+    shading = (1 + 0.08 * x**2)[None, :, None]  # 8 % brighter at the sides: no gain, no lens
     flat = [np.rint(np.full((136, 240, 3), 160.0) * shading).astype(np.uint8) for _ in frames]
     panorama = composite_of(tmp_path, frames, surface, flat)
     row = panorama.image[surface.height // 2].astype(float).mean(axis=-1)
