@@ -1,7 +1,8 @@
 """Two pictures, one homography: `register`, for whoever has no clip and no camera, only two images.
 
-The direct estimator over all levels from a start or from identity; where that fails, again from phase correlation, then
-from features. Whatever the start, the result is the direct estimator's and has to pass its score.
+The direct estimator over all levels from a start or from identity; where that fails, again from phase correlation, from
+features, then from the shifts at which most pixels agree. Whatever the start, the result is the direct estimator's and
+has to pass its score.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from mosaic.kernels import KernelName
 from mosaic.pyramid import Pyramid, build_pyramid, n_levels_for
 from mosaic.records import PAIR_REASONS, FloatArray, PairFit, PairStatus
 from mosaic.rescue import match_features, phase_correlation, small_gray
+from mosaic.rivals import shift_starts
 from mosaic.template import PreparedTemplate, SelectionOptions, build_template, prepare
 from mosaic.warp import HomographyFamily
 
@@ -101,9 +103,9 @@ def register(
     other. kernel: 'numba' (default) or 'torch', the readable reference: equal within 1e-3 px, slower.
 
     Returns PairFit with src = 0 (a), dst = 1 (b): H_dst_src maps px of a into b, det 1, NaN when failed. reason: a
-    code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation', 'features' or
-    'fine features', with ', blur matched' behind it where that was done;
-    n_steps counts all that were tried.
+    code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation', 'features',
+    'fine features' or 'shift', with ', blur matched' behind it where that was done; n_steps counts all that were
+    tried.
     Raises ValueError or TypeError for pictures, masks or a start of the wrong shape, type or value.
     """
     options = options or PairOptions()
@@ -162,7 +164,7 @@ def _best_of_starts(
     best: PairFit | None = None
     reverse: PreparedTemplate | None = None
     n_steps = 0
-    for route, H in _starts(source, target, start, options.rescue):
+    for route, H in _starts(source, target, prepared, start, options):
         for some in _ladders(route, levels):
             fit, _ = align(prepared, target, H, dst=1, levels=some, options=options.estimator, route=route)
             n_steps += fit.n_steps
@@ -193,7 +195,7 @@ def _ladders(route: str, levels: list[int]) -> list[list[int]]:
     """
     return (
         [[1, 0], levels]
-        if route in ("start", "features", "fine features") and levels[0] > 1 and 1 in levels
+        if route in ("start", "features", "fine features", "shift") and levels[0] > 1 and 1 in levels
         else [levels]
     )
 
@@ -280,7 +282,11 @@ def _checked(start: ArrayLike | None) -> FloatArray | None:
 
 
 def _starts(
-    source: Pyramid, target: Pyramid, start: FloatArray | None, rescue: bool
+    source: Pyramid,
+    target: Pyramid,
+    prepared: PreparedTemplate,
+    start: FloatArray | None,
+    options: PairOptions,
 ) -> Iterator[tuple[str, FloatArray]]:
     """Routes and their starts H_b_a, the cheap ones first; a later one is only made when it is asked for."""
     # Area scaling of the one frame to the size of the other: identity for equal sizes.
@@ -289,8 +295,9 @@ def _starts(
     if start is not None:
         yield "start", start
     yield "identity", normalise_homography(scaling)
-    if not rescue:
+    if not options.rescue:
         return
+    estimator = options.estimator
     small_a, small_b = _without_masked(source), _without_masked(target)
     # Both rescues measure as if b had the size of a.
     H, _ = phase_correlation(small_a, small_b, source.size_px)
@@ -304,6 +311,10 @@ def _starts(
         found = match_features(fine_a, fine_b, source.size_px, n_features=5000)
         if found is not None:
             yield "fine features", normalise_homography(scaling @ found)
+    # Where things that move hold most corners and most of the spectrum, the still scene may hold most pixels.
+    levels = [i for i in (1, 0) if i < len(source.levels) and _n_pixels(prepared, i) >= estimator.min_pixels]
+    for H in shift_starts(prepared, target, normalise_homography(scaling), levels=levels, options=estimator):
+        yield "shift", H
 
 
 def _without_masked(pyramid: Pyramid, width_px: int = 640) -> NDArray[np.uint8]:

@@ -193,6 +193,26 @@ def test_moving_things_in_most_of_the_gradients_are_noticed_both_ways(seed):
     assert alone.reason in REASONS and (not wrong or alone.status == PairStatus.WEAK)
 
 
+def _board_over_weak_ground(seed: int, H: np.ndarray | None, runs_px: float) -> np.ndarray:
+    """Ground of 6 grey levels and a board of 60 over a sixth of the picture, whose content has run by runs_px."""
+    xy = grid() if H is None else transfer(np.linalg.inv(H), grid())
+    board = look(seed + 50, xy - np.array([runs_px, 0.0]), finest_px=2.0, contrast=60)
+    on_board = (xy[..., 1] > 100) & (xy[..., 1] < 145)
+    return np.where(on_board, board, picture(seed, H, contrast=6))
+
+
+@pytest.mark.parametrize(("pan_px", "runs_px"), [(-30.0, 20.0), (-60.0, 18.0)])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_scene_is_found_beside_a_board_that_runs_and_has_most_of_the_gradients(seed, pan_px, runs_px):
+    """From identity, phase correlation and features it ended at the board, 20 px off, and was called ok or weak."""
+    H = homography(dx=pan_px, dy=2, zoom=1.01)
+    a = as_uint8(_board_over_weak_ground(seed, None, 0.0), noise=2, seed=1)
+    b = as_uint8(_board_over_weak_ground(seed, H, runs_px), noise=2, seed=2)
+    fit = register(a, b)
+    assert (fit.status, fit.route) == (PairStatus.OK, "shift")
+    assert corner_error_px(fit.H_dst_src, H) < 0.5
+
+
 def test_every_form_of_a_picture_gives_the_same():
     H = homography(5, -4, 1.02, 0.5)
     a, b = as_uint8(picture(1)), as_uint8(picture(1, H))
