@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.registration.peers import ALL, VIDEO
+from benchmarks.registration.scenes import PHOTOGRAPHS
 
 FAILED_PX = 2.0
 Row = dict[str, Any]
@@ -64,10 +65,11 @@ def cells_table(rows: list[Row]) -> list[str]:
 
 
 def grouped(rows: list[Row]) -> dict[tuple[str, str, int], list[Row]]:
-    """Rows by (size, condition, gap), in the order of first appearance."""
+    """Rows by (size, condition, gap), photographs apart, in the order of first appearance."""
     cells: dict[tuple[str, str, int], list[Row]] = defaultdict(list)
     for row in rows:
-        cells[row["size"], row["condition"], row["gap"]].append(row)
+        picture = row["size"] + (" photograph" if row["kind"] in PHOTOGRAPHS else "")
+        cells[picture, row["condition"], row["gap"]].append(row)
     return cells
 
 
@@ -188,7 +190,10 @@ def write_tables(source: Path, out: Path | None, picture: Path | None) -> None:
     lines = source.read_text(encoding="utf-8").splitlines()
     rows = list({row["key"]: row for row in map(json.loads, lines)}.values())
     order = list(dict.fromkeys(r["condition"] for r in rows))
-    rows = sorted(rows, key=lambda r: (r["size"] != "1080p", order.index(r["condition"]), r["gap"]))
+    rows = sorted(
+        rows,
+        key=lambda r: (r["size"] != "1080p", r["kind"] in PHOTOGRAPHS, order.index(r["condition"]), r["gap"]),
+    )
     text = "\n".join([*verdict_table(rows), "", *against_peers(rows), "", *cells_table(rows), ""])
     if out is None:
         print(text)
