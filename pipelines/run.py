@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from mosaic.estimator import RegisterOptions
 from pipelines.archive import program_version
@@ -101,6 +102,7 @@ def process(
     started = time.perf_counter()
     cv2.setNumThreads(config.run.threads or 2)
     with (
+        threadpool_limits(1, user_api="blas"),  # its matrices are small, and our own threads use the cores
         open_clip(clip, config.decode) as opened,
         OutputFolder(out, run_digest(config, opened.facts.identity()), resume=resume) as folder,
         tempfile.TemporaryDirectory(prefix=".scratch-", dir=folder.staging) as scratch,
