@@ -78,3 +78,13 @@ def find_bridge(e2: Array, packed: Packed, ok: NDArray[np.bool_], tried: NDArray
     span = np.abs(packed.ia[crossing] - packed.ib[crossing])
     median = np.median(np.where(packed.dof[crossing] > 0, e2[crossing], np.inf), axis=1)
     return int(crossing[np.lexsort((median, span))[0]])
+
+
+def common_variance(kappa: Array, chi2_dof: float) -> float:
+    """How many stated variances an edge's common errors make of one: measurements that share them count once.
+
+    The mean of the edges' kappa (E,), or what the fit's chi2 per degree of freedom shows if that is more; at least 1,
+    which is all that can be said where neither is known (NaN: no edge's points can be seen from the solution).
+    """
+    known = kappa[np.isfinite(kappa)]
+    return max(1.0, float(known.mean()) if known.size else 1.0, chi2_dof if np.isfinite(chi2_dof) else 1.0)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import distortion, rotation
+from calib.edges import common_variance
 from calib.records import HomographyGraph, Solution, Verdict
 from calib.refine import RefineOptions
 from calib.systematic import distortion_extreme, sigma_parts
@@ -202,7 +203,7 @@ def _invertible(solution: Solution) -> NDArray[np.bool_]:
 def _ambiguous(solution: Solution, total: float) -> bool:
     if len(solution.starts) < 2:
         return False
-    kappa = max(float(np.nanmean(solution.edge_kappa[solution.edge_ok])), solution.chi2_dof, 1.0)
+    kappa = common_variance(solution.edge_kappa[solution.edge_ok], solution.chi2_dof)
     best = min(solution.starts, key=lambda s: s.cost)
     return any(
         abs(s.mean_log_f_over_w - best.mean_log_f_over_w) > max(total, 0.02)

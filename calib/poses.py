@@ -14,7 +14,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from calib.covariance import edge_statistics
-from calib.edges import find_bad_edges, linked_to
+from calib.edges import common_variance, find_bad_edges, linked_to
 from calib.problem import Loss, Packed, State, linearise, pack, robust_scale, whitened_squares
 from calib.records import HomographyGraph, Solution
 from calib.selected_inverse import inverse_diagonal_blocks
@@ -215,9 +215,7 @@ def _summarise(
     with np.errstate(all="ignore"):
         chi2_dof = float(np.nansum((chi2 * packed.dof.sum(1))[fit]) / dof) if fit.any() else float("nan")
     # An edge's errors are common to its cells: kappa, where the data show it; at least chi2.
-    inflate = max(
-        1.0, chi2_dof if np.isfinite(chi2_dof) else 1.0, float(np.nanmean(kappa[fit])) if fit.any() else 1.0
-    )
+    inflate = common_variance(kappa[fit], chi2_dof)
     if matrix is not None and len(system.free):
         try:
             if system.band <= MAX_BAND:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.camera import SHARED
+from calib.edges import common_variance
 from calib.level import LevelOptions, level
 from calib.parallax import Parallax
 from calib.problem import Loss, Packed, PriorTerms, linearise, pack, residuals, state_of
@@ -164,7 +165,7 @@ def _step(
     normal = np.einsum("em,kemx,lemx->kl", weight, P, P) - coupling @ eliminated.T
     gradient = np.einsum("em,kemx,emx->k", weight, P, e) - eliminated @ equations.gradient[0]
     # The prior is of the measurements' own scale, so that it does not fade as edges that share errors are added.
-    kappa = _common(solution)
+    kappa = common_variance(solution.edge_kappa[solution.edge_ok], solution.chi2_dof)
     information = normal / kappa + np.diag(prior)
     mean = np.array([options.over_height, options.over_stand])
     return np.linalg.solve(information, gradient / kappa + prior * (mean - ratios)), np.linalg.inv(
@@ -209,18 +210,14 @@ def fit_pupil(graph: HomographyGraph, solution: Solution, options: PupilOptions 
     std = np.sqrt(np.diagonal(cov))
     if not (ratios > options.min_sigmas * std).any():
         return _refused(solution, graph, "not_significant", ratios, std)
-    if not (solution.cost - best.cost) / _common(solution) > options.min_gain:
+    kappa = common_variance(solution.edge_kappa[solution.edge_ok], solution.chi2_dof)
+    if not (solution.cost - best.cost) / kappa > options.min_gain:
         return _refused(solution, graph, "not_better", ratios, std)
     return PupilFit(
         over_height=float(ratios[0]), over_stand=float(ratios[1]), over_height_std=float(std[0]),
         over_stand_std=float(std[1]), accepted=True, reason="ok", sentence=SENTENCES["ok"], solution=best,
         graph=corrected, parallax=parallax, shift_log_f=float(np.mean(best.log_f - solution.log_f)),
     )  # fmt: skip
-
-
-def _common(solution: Solution) -> float:
-    """How many stated variances an edge's common errors make of one: measurements that share them count once."""
-    return max(float(np.nanmean(solution.edge_kappa[solution.edge_ok])), solution.chi2_dof, 1.0)
 
 
 def _refused(

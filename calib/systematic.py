@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.covariance import edge_statistics
+from calib.edges import common_variance
 from calib.problem import Loss, Packed, pack, residuals, state_of, whitened_squares
 from calib.records import HomographyGraph, Solution
 from calib.refine import RefineOptions, refine
@@ -154,7 +155,7 @@ def constant_k_sigma(
     if not constant.converged:
         return 0.0, 0.0
     difference = _mean_difference(constant, solution)
-    kappa = max(float(np.nanmean(solution.edge_kappa[solution.edge_ok])), solution.chi2_dof, 1.0)
+    kappa = common_variance(solution.edge_kappa[solution.edge_ok], solution.chi2_dof)
     z2 = max(constant.cost - solution.cost, 0.0) / kappa
     return abs(difference) / (1 + z2 / 4), difference
 

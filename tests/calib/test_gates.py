@@ -182,6 +182,9 @@ def test_poses_between_keyframes():
     assert np.isnan(lonely.log_f[2]) and np.isnan(lonely.R[2]).all()
     with pytest.raises(ValueError):
         solve_poses(HomographyGraph(frames=np.array([98, 99]), edges=(), size_px=(1280, 720)), held)
+    # A lens that folds the whole picture away sees none of the measurements: no fit, and not a word on the terminal.
+    folded = solve_poses(graph, replace(held, lens=replace(held.lens, c0=-2.0)))
+    assert not folded.converged and np.isnan(folded.edge_kappa).all()
 
 
 @pytest.mark.parametrize("band", [1, 3])
