@@ -15,7 +15,7 @@ from scipy.sparse import csgraph
 
 from calib import distortion, homography, rotation
 from calib.dlt import dlt
-from calib.problem import Packed, State
+from calib.problem import Packed, State, chunks
 
 Array = NDArray[np.float64]
 
@@ -193,11 +193,14 @@ def ideal_homographies(packed: Packed, k1_half: Array, pp_px: Array, aspect: flo
 
     Where the points do not determine one, the edge's own H stands in.
     """
-    a, b, root = packed.points()
     W = packed.size_px[0]
     k = np.asarray(k1_half, float)[:, None, None]
-    ideal_a, ideal_b = distortion.undistort(a, pp_px, k, W), distortion.undistort(b, pp_px, k, W)
-    H = centred(dlt(ideal_a, ideal_b, np.broadcast_to(root, (len(k), *root.shape))), pp_px, W, aspect)
+    H = np.empty((len(k), packed.n_edges, 3, 3))
+    for part in chunks(packed.n_edges, len(k), packed.dof.shape[1]):
+        a, b, root = packed.select(part).points()
+        ideal_a, ideal_b = distortion.undistort(a, pp_px, k, W), distortion.undistort(b, pp_px, k, W)
+        fitted = dlt(ideal_a, ideal_b, np.broadcast_to(root, (len(k), *root.shape)))
+        H[:, part] = centred(fitted, pp_px, W, aspect)
     own = centred(packed.H, pp_px, W, aspect)
     return np.where(np.isfinite(H).all((-1, -2), keepdims=True), H, own)
 

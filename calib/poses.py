@@ -149,9 +149,9 @@ def solve_poses(
     is_held = np.array([frame in rows for frame in graph.frames.tolist()])
     if not is_held.any():
         raise ValueError("solve_poses() needs at least one frame of the graph in `held`")
-    everything = pack(graph)
-    useful = everything.dof.sum(1) >= 6
-    packed = everything.select(useful)
+    packed = pack(graph)
+    useful = packed.dof.sum(1) >= 6
+    packed = packed.select(useful)
     reference = int(np.flatnonzero(is_held)[0])
     state = _initial(packed, graph, held, reference, start)
     free = ~is_held

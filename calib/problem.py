@@ -58,7 +58,9 @@ class Packed:
         return float(np.log(self.size_px[0]))
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Packed:
-        """The same frames with some of the edges."""
+        """The same frames with some of the edges; with all of them, the same arrays."""
+        if isinstance(keep, np.ndarray) and keep.dtype == bool and keep.all():
+            return self
         return replace(
             self, ia=self.ia[keep], ib=self.ib[keep], a_x=self.a_x[keep], a_y=self.a_y[keep], b_x=self.b_x[keep],
             b_y=self.b_y[keep], s11=self.s11[keep], s12=self.s12[keep], s22=self.s22[keep], dof=self.dof[keep],
@@ -98,6 +100,23 @@ def pack(graph: HomographyGraph, edges: Sequence[HomographyEdge] | None = None) 
     """Arrays of a graph's edges (or of the given ones among its frames). Non-finite points carry no information."""
     edges = graph.edges if edges is None else tuple(edges)
     rows = {frame: k for k, frame in enumerate(graph.frames.tolist())}
+    centre = ((graph.size_px[0] - 1) / 2, (graph.size_px[1] - 1) / 2)
+    E, m = len(edges), max([1, *(len(e.grid_a) for e in edges)])
+    # a_x, a_y, b_x, b_y, s11, s12, s22, dof: all that a long shot needs room for.
+    columns = [np.full((E, m), empty) for empty in (*centre, *centre, 0.0, 0.0, 0.0, 0.0)]
+    for part in chunks(E, 1, m):
+        _fill(edges[part], [column[part] for column in columns], centre)
+    a_x, a_y, b_x, b_y, s11, s12, s22, dof = columns
+    return Packed(
+        ia=np.array([rows[e.a] for e in edges], int), ib=np.array([rows[e.b] for e in edges], int),
+        a_x=a_x, a_y=a_y, b_x=b_x, b_y=b_y, s11=s11, s12=s12, s22=s22, dof=dof,
+        H=np.array([e.H for e in edges], float).reshape(-1, 3, 3),
+        n_frames=len(graph.frames), size_px=graph.size_px, log_f_pp=float(np.log(graph.size_px[0])),
+    )  # fmt: skip
+
+
+def _fill(edges: Sequence[HomographyEdge], columns: list[Array], centre: tuple[float, float]) -> None:
+    """The edges' points written to Packed's columns (E, m), which hold what an edge without a point has there."""
     count = np.array([len(e.grid_a) for e in edges], int)
     kappa = np.array([e.kappa for e in edges], float)
     a = np.concatenate([np.empty((0, 2)), *(e.grid_a for e in edges)])
@@ -110,7 +129,6 @@ def pack(graph: HomographyGraph, edges: Sequence[HomographyEdge] | None = None) 
     info[~finite] = 0.0
     # A point without information must not decide whether a camera is possible: it goes to the centre.
     unknown = info.sum((-1, -2)) == 0
-    centre = ((graph.size_px[0] - 1) / 2, (graph.size_px[1] - 1) / 2)
     a[unknown] = b[unknown] = centre
     S = square_root_information(info)
     half, diff = 0.5 * (info[:, 0, 0] + info[:, 1, 1]), 0.5 * (info[:, 0, 0] - info[:, 1, 1])
@@ -118,21 +136,10 @@ def pack(graph: HomographyGraph, edges: Sequence[HomographyEdge] | None = None) 
     # A direction worse than 1 px counts as unknown. kappa widens the edge but does not remove measurements.
     one = 1 / np.repeat(kappa, count)
     dof = (half - spread > one).astype(float) + (half + spread > one)
-    place = np.arange(count.max(initial=1)) < count[:, None]
-
-    def padded(values: Array, empty: float = 0.0) -> Array:
-        out = np.full(place.shape, empty)
-        out[place] = values
-        return out
-
-    return Packed(
-        ia=np.array([rows[e.a] for e in edges], int), ib=np.array([rows[e.b] for e in edges], int),
-        a_x=padded(a[:, 0], centre[0]), a_y=padded(a[:, 1], centre[1]),
-        b_x=padded(b[:, 0], centre[0]), b_y=padded(b[:, 1], centre[1]),
-        s11=padded(S[:, 0, 0]), s12=padded(S[:, 0, 1]), s22=padded(S[:, 1, 1]), dof=padded(dof),
-        H=np.array([e.H for e in edges], float).reshape(-1, 3, 3),
-        n_frames=len(graph.frames), size_px=graph.size_px, log_f_pp=float(np.log(graph.size_px[0])),
-    )  # fmt: skip
+    place = np.arange(columns[0].shape[1]) < count[:, None]
+    values = (a[:, 0], a[:, 1], b[:, 0], b[:, 1], S[:, 0, 0], S[:, 0, 1], S[:, 1, 1], dof)
+    for column, value in zip(columns, values, strict=True):
+        column[place] = value
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,8 @@
 """Records that calib takes and gives. Points are raw (distorted) pixels unless a name says otherwise; radians.
 
 H_b_a maps pixels of a into b, R_cam_world world axes into camera axes, f is fx in pixels of the decoded width W and is
-carried as log f: sigma(log f) is the relative error. Arrays inside a record are read-only copies.
+carried as log f: sigma(log f) is the relative error. Arrays inside a record are read-only: copies, but of what nobody
+can write to.
 """
 
 from __future__ import annotations
@@ -21,7 +22,10 @@ BoolArray = NDArray[np.bool_]
 
 
 def _freeze(record: object, name: str, shape: tuple[int | None, ...], dtype: type = float) -> None:
-    value: NDArray[Any] = np.array(getattr(record, name), dtype=dtype, copy=True)
+    value: NDArray[Any] = np.asarray(getattr(record, name), dtype=dtype)
+    if value.flags.writeable or not value.flags.owndata:
+        # An array that nobody can write to is shared: of a long shot's pairs there are several records each.
+        value = np.array(value, copy=True)
     if value.ndim != len(shape) or any(
         s is not None and s != n for s, n in zip(shape, value.shape, strict=True)
     ):

@@ -36,10 +36,12 @@ PAIR_REASONS = {
 
 
 def freeze_arrays(record: object) -> None:
-    """Replace every array of a frozen record by a read-only copy, since `frozen` does not freeze an array."""
+    """Every array of a frozen record read-only, since `frozen` does not freeze an array: a copy of what may be written
+
+    to, but an array that nobody can write to (another record's) is shared."""
     for item in fields(record):  # type: ignore[arg-type]
         value = getattr(record, item.name)
-        if isinstance(value, np.ndarray):
+        if isinstance(value, np.ndarray) and (value.flags.writeable or not value.flags.owndata):
             copied = np.array(value, copy=True)
             copied.setflags(write=False)
             object.__setattr__(record, item.name, copied)
