@@ -20,9 +20,10 @@ from mosaic.pyramid import Pyramid
 from mosaic.records import PairFit
 from pipelines.config import RegistrationOptions
 from pipelines.keyframe_graph import KeyframeImages
+from pipelines.keyframes import Keyframe
 from pipelines.shot import CalibratedShot
 from pipelines.table import FrameFacts
-from pipelines.tracking import Keyframe, Observation, ShotTracker
+from pipelines.tracking import Observation, ShotTracker
 
 # A 1080p shot keeps up to a hundred frames of 6 MB and a picture of 2 MB per keyframe; two hundred such shots fit.
 SCRATCH_BYTES = 100_000_000_000
