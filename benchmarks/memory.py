@@ -38,8 +38,8 @@ def make_loop(path: Path, width: int) -> Path:
     return path
 
 
-def loop(source: Path, target: Path, times: int) -> Path:
-    """The packets of `source` again and again, time stamps moved on."""
+def loop(source: Path, target: Path, times: int, n_frames: int = LOOP_FRAMES) -> Path:
+    """The packets of `source`, a clip of n_frames, again and again, time stamps moved on."""
     with av.open(str(target), "w") as output:
         stream = None
         for turn in range(times):
@@ -48,7 +48,7 @@ def loop(source: Path, target: Path, times: int) -> Path:
                 if stream is None:
                     stream = output.add_stream_from_template(video)
                 assert video.time_base is not None
-                shift = round(turn * LOOP_FRAMES / FPS / video.time_base)
+                shift = round(turn * n_frames / FPS / video.time_base)
                 for packet in container.demux(video):
                     if packet.dts is None or packet.pts is None:
                         continue  # the flush at the end
