@@ -166,7 +166,9 @@ def _free_to_previous(
         source, look.pyramid, predicted, dst=look.frame, levels=levels, options=options, route="eight parameters"
     )  # fmt: skip
     if not fit.usable and not np.array_equal(predicted, still):
-        fit, H = align(source, look.pyramid, still, dst=look.frame, levels=levels, route="still")
+        fit, H = align(
+            source, look.pyramid, still, dst=look.frame, levels=levels, options=options, route="still"
+        )
     fit, H = better_of_rivals(source, look.pyramid, fit, H, still, levels=levels, options=options)
     expected_px, _ = centre_motion(predicted, look.pyramid.size_px)
     return _beyond_graphics(source, look, fit, H, predicted, expected_px, options)
@@ -219,7 +221,9 @@ def _camera_to_previous(
     if fit.status != PairStatus.OK and near != levels:
         fit, state = align(source, look.pyramid, start, dst=look.frame, levels=levels, options=options)
     if not fit.usable:
-        fit, state = align(source, look.pyramid, still, dst=look.frame, levels=levels, route="still")
+        fit, state = align(
+            source, look.pyramid, still, dst=look.frame, levels=levels, options=options, route="still"
+        )
     fit, state = better_of_rivals(source, look.pyramid, fit, state, still, levels=levels, options=options)
     expected_px = width_px * distance_in_widths(before, predicted, width_px)
     return _beyond_graphics(source, look, fit, state, start, expected_px, options)
