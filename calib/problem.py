@@ -155,8 +155,15 @@ class State:
         return State(self.log_f[which], self.R[which], self.shared[which])
 
     def moved(self, frames: Array, shared: Array) -> State:
-        """Steps (S, n, 4) and (S, 5 or 8) applied: rotations from the left, made orthonormal again."""
-        R = rotation.orthonormalise(rotation.exp(frames[..., 1:]) @ self.R)
+        """Steps (S, n, 4) and (S, 5 or 8) applied: rotations from the left, made orthonormal again.
+
+        Pixels show a focal length times an angle: the data's flat valley is angle = constant / f, and a straight step of
+        d in the mean log f leaves it by d^2 / 2 of the angles. Turned by (1 - exp(-d)) / d as far, it stays in; small
+        steps are the same.
+        """
+        mean = frames[..., 0].mean(-1)[:, None, None]
+        bent = np.where(np.abs(mean) > 1e-9, -np.expm1(-mean) / np.where(mean == 0, 1.0, mean), 1.0)
+        R = rotation.orthonormalise(rotation.exp(frames[..., 1:] * bent) @ self.R)
         return State(self.log_f + frames[..., 0], R, self.shared + shared)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib import HomographyEdge, HomographyGraph, KnownFocal, Priors, RefineOptions, refine, solver
+from calib import HomographyEdge, HomographyGraph, KnownFocal, Priors, RefineOptions, refine, rotation, solver
 from calib.problem import Loss, PriorTerms, State, linearise, pack
 from tests.calib import tracks
 
@@ -290,3 +290,31 @@ def test_records_refuse_wrong_shapes_and_stay_as_they_are():
         replace(graph, frames=graph.frames[:1])
     with pytest.raises(ValueError, match="reference"):
         refine(graph, options=RefineOptions(reference=999))
+
+
+def long_pan(seed=4, n=60):
+    """A fast pan past narrow views, each linked to its next ones only: the valley of focal lengths is long and bent."""
+    return make(seed, n=n, pan_deg=110, f_w=2.0, zoom=1.1, max_span=2)
+
+
+def test_a_step_in_focal_length_stays_in_the_valley():
+    truth, _ = long_pan()
+    shared, angles, d = np.zeros((1, 5)), rotation.log(truth.R), 0.1
+    state = State(truth.log_f[None], truth.R[None], shared)
+    frames = np.concatenate([np.full((1, len(angles), 1), d), -d * angles[None]], -1)
+    bent = state.moved(frames, shared)
+    np.testing.assert_allclose(bent.log_f, state.log_f + d)
+    np.testing.assert_allclose(bent.R[0], rotation.exp(angles * np.exp(-d)), atol=1e-12)
+    # To first order it is the plain step.
+    tiny = state.moved(1e-6 * frames, shared)
+    np.testing.assert_allclose(tiny.R, rotation.exp(1e-6 * frames[..., 1:]) @ state.R, atol=1e-11)
+
+
+def test_a_long_pan_is_solved_in_few_steps():
+    _, graph = long_pan()
+    best = refine(graph)
+    far = replace(best, log_f=best.log_f - 0.25, R=rotation.exp(rotation.log(best.R) * np.exp(0.25)))
+    again = refine(graph, start=far)
+    assert best.converged and again.converged
+    assert abs(again.cost / best.cost - 1) < 1e-5
+    assert again.n_steps < 30  # 12; with straight steps 56
