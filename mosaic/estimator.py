@@ -6,7 +6,8 @@ hands on is the residual-flow grid: where each textured cell was found, whatever
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -22,10 +23,10 @@ from mosaic.pyramid import Pyramid
 from mosaic.records import FloatArray, FlowGrid, PairFit, PairStatus
 from mosaic.solve import newton_step, step_in_sigmas
 from mosaic.template import PreparedTemplate, mask_arguments
-from mosaic.verdict import alignment_score, pixel_information
+from mosaic.verdict import alignment_score, pixel_information, regional_evidence
 from mosaic.warp import WarpFamily
 
-__all__ = ["RegisterOptions", "align"]
+__all__ = ["RegisterOptions", "align", "cost_at", "judge_minority", "settle"]
 
 
 def align(
@@ -47,13 +48,9 @@ def align(
     template = source.template
     if levels is None:
         levels = [i for i in range(len(template.levels) - 1, -1, -1) if template.levels[i] is not None]
-    masks = mask_arguments(target)
     state = start
     n_steps = 0
-    pair = LevelPair(
-        source, target, levels[0], 1.0, 0.0, masks, kernels.load(options.kernel),
-        _asked(source.family, "pull"),
-    )  # fmt: skip
+    pair = _pair(source, target, levels[0], options)
     for index in levels:
         pair.index = index
         # From coarse values whatever the level: in between nothing is new.
@@ -77,6 +74,13 @@ def _asked(family: WarpFamily, method: str) -> Any:
 
     By name: asking a protocol takes .2 ms, longer than a small kernel."""
     return getattr(family, method, None)
+
+
+def _pair(source: PreparedTemplate, target: Pyramid, index: int, options: RegisterOptions) -> LevelPair:
+    return LevelPair(
+        source, target, index, 1.0, 0.0, mask_arguments(target), kernels.load(options.kernel),
+        _asked(source.family, "pull"),
+    )  # fmt: skip
 
 
 def _gain(pair: LevelPair, state: Any) -> tuple[float, float]:
@@ -149,26 +153,110 @@ def _polish(
     Players, crowd and whatever else moves widen the robust scale, and with it they keep a pull on the alignment: the
     scale that is right to find it is too wide to finish it (an MM-estimator: Yohai 1987).
     """
+    fine.sigma = pair.kernel.inlier_scale(fine.residual, fine.scale)
+    if not fine.sigma * _OUTLIERS < fine.scale:
+        return state, 0, fine
+    return _descend(pair, state, fine, options.polish_steps, 1, options)
+
+
+def _descend(
+    pair: LevelPair, state: Any, now: Linearised, max_steps: int, tries: int, options: RegisterOptions
+) -> tuple[Any, int, Linearised]:
+    """Steps at the scale now.sigma, held fixed, as long as Tukey's cost falls; tries: of ever shorter steps."""
     kernel = pair.kernel
-    fine.sigma = kernel.inlier_scale(fine.residual, fine.scale)
     steps = 0
-    while steps < options.polish_steps and fine.sigma * _OUTLIERS < fine.scale:
-        weight = kernel.robust_weights(fine.residual, np.float32(fine.sigma), True)
-        N, b = _normal_equations(pair, state, fine, weight, fine.sigma)
+    cost = kernel.tukey_cost(now.residual, now.sigma)
+    while steps < max_steps:
+        weight = kernel.robust_weights(now.residual, np.float32(now.sigma), True)
+        N, b = _normal_equations(pair, state, now, weight, now.sigma)
         step = newton_step(N, b, 0.0)
         if step is None:
             break
-        trial_state = pair.source.family.update(state, step)
-        trial = pair.evaluate(trial_state)
-        steps += 1
-        before, after = (kernel.tukey_cost(x.residual, fine.sigma) for x in (fine, trial))
-        if trial.n_valid < options.min_pixels or not after < before:
+        for attempt in range(tries):
+            trial_state = pair.source.family.update(state, step / 3**attempt)
+            trial = pair.evaluate(trial_state)
+            steps += 1
+            after = kernel.tukey_cost(trial.residual, now.sigma)
+            good = trial.n_valid >= options.min_pixels and after < cost
+            if good:
+                break
+        if not good:
             break
-        trial.sigma = fine.sigma
-        state, fine = trial_state, trial
-        if step_in_sigmas(N, step, fine.sigma**2) < options.stop_sigmas:
+        trial.sigma = now.sigma
+        state, now, cost = trial_state, trial, after
+        if step_in_sigmas(N, step, now.sigma**2) < options.stop_sigmas:
             break
-    return state, steps, fine
+    return state, steps, now
+
+
+def settle(
+    source: PreparedTemplate,
+    target: Pyramid,
+    start: Any,
+    *,
+    levels: Sequence[int],
+    greys: Sequence[float],
+    options: RegisterOptions,
+    pull: Callable[[Any], tuple[FloatArray, FloatArray]] | None = None,
+) -> tuple[Any, int]:
+    """Steps from a good start on the pixels that agree to within a deviation fixed beforehand, greys: one a level.
+
+    Where most pixels belong to things that move, no quantile of the residuals is the noise: the scale that `align`
+    finds is theirs, and it drifts away from the truth itself (measured: 40 % players in either picture, 60 frames
+    apart, 5 % to 20 % of the pixels still: 2 to 50 px; at 2 grey levels .1 to .7 px). pull: what else is known of the
+    state (pulled.PulledWarp), in place of what the family knows.
+    Returns (state, steps); the start where a level lacks texture.
+    """
+    pair = _pair(source, target, levels[0], options)
+    pair.pull = pull or pair.pull
+    state, n_steps = start, 0
+    for index, grey in zip(levels, greys, strict=True):
+        pair.index = index
+        level = source.template.levels[index]
+        if level is None or len(level.src_px) < options.min_pixels:
+            return start, n_steps
+        pair.gain, pair.offset = _gain(pair, state)
+        now = pair.evaluate(state)
+        now.sigma = grey
+        state, steps, now = _descend(pair, state, now, options.max_steps[0], 3, options)
+        n_steps += steps
+    return state, n_steps
+
+
+def cost_at(
+    source: PreparedTemplate, target: Pyramid, state: Any, grey: float, options: RegisterOptions
+) -> tuple[float, float]:
+    """(Tukey's cost 0..1, deviation of the pixels that agree) of the finest level at a state.
+
+    grey: the deviation that the cost is for, and the largest that is believed of the pixels that agree."""
+    pair = _pair(source, target, 0, options)
+    pair.gain, pair.offset = _gain(pair, state)
+    residual = pair.evaluate(state).residual
+    return float(pair.kernel.tukey_cost(residual, grey)), float(pair.kernel.inlier_scale(residual, grey))
+
+
+def judge_minority(
+    source: PreparedTemplate,
+    target: Pyramid,
+    state: Any,
+    *,
+    dst: int,
+    grey: float,
+    options: RegisterOptions,
+    route: str,
+    n_steps: int,
+    supported: bool,
+) -> PairFit:
+    """The verified PairFit of a state that only a part of the pixels may agree with, to within a deviation.
+
+    Judged like any other, but where the score or the share of agreeing pixels refuses it, it is weak (`minority`) if
+    regions all over the overlap agree better than shifted, or supported: something else than pixels speaks for it.
+    """
+    pair = _pair(source, target, 0, options)
+    pair.gain, pair.offset = _gain(pair, state)
+    fine = pair.evaluate(state)
+    fine.sigma = pair.kernel.inlier_scale(fine.residual, grey)
+    return _judge(pair, state, fine, n_steps, dst, route, options, minority=True, supported=supported)
 
 
 def _judge(
@@ -179,6 +267,8 @@ def _judge(
     dst: int,
     route: str,
     options: RegisterOptions,
+    minority: bool = False,
+    supported: bool = False,
 ) -> PairFit:
     template = pair.source.template
     level, kernel = pair.pixels, pair.kernel
@@ -192,13 +282,19 @@ def _judge(
     inliers = float((weight > 0.1).sum()) / fine.n_valid
     reason = ""
     status = PairStatus.OK
-    if not score < options.score_weak:
-        return _failed(template.frame, dst, template.size_px, "score", route, n_steps, score=score)
-    if inliers < options.min_inliers:
-        return _failed(template.frame, dst, template.size_px, "few_inliers", route, n_steps, score=score)
-    if score > options.score_ok:
+    refused = (
+        "score" if not score < options.score_weak else "few_inliers" if inliers < options.min_inliers else ""
+    )
+    if minority and (refused or score > options.score_ok):
+        needed = options.evidence if refused else options.evidence_scored
+        refused = "" if supported or regional_evidence(pair, fine) > needed else refused or "score"
+        status, reason = PairStatus.WEAK, "minority"
+    if refused:
+        return _failed(template.frame, dst, template.size_px, refused, route, n_steps, score=score)
+    if score > options.score_ok and not reason:
         status, reason = PairStatus.WEAK, "score"
-    flow = measure_flow(pair, state, fine, options)
+    # A minority's own noise, not the scale of what moves.
+    flow = measure_flow(pair, state, replace(fine, scale=fine.sigma) if minority else fine, options)
     if len(flow.cell) < 6:
         return _failed(template.frame, dst, template.size_px, "no_texture", route, n_steps, score=score)
     anchors = default_anchors(template.size_px)

@@ -23,7 +23,9 @@ class RegisterOptions:
     share of its own standard deviation (the next one would be far smaller); stop_sigmas_coarse: of coarse levels, which
     only hand on. polish_steps: more on the finest level, where the scale is larger than that of the pixels that agree.
     min_overlap, min_inliers: shares of informative pixels. score_ok, score_weak: largest residual scale
-    against that of shifted pictures. cell_floor_px: error of a cell's place that is not noise (crowd, codec;
+    against that of shifted pictures. evidence, evidence_scored: what a minority of the pixels must show of
+    verdict.regional_evidence to be weak and not failed, where the score refuses it and where it lies between the two.
+    cell_floor_px: error of a cell's place that is not noise (crowd, codec;
     real-footage.md 6.3). cell_max_px: directions less certain are dropped. cell_linear_px: residual flow beyond which
     it is no measurement, found in flow_passes local steps. correlation: variance inflation of a cell, whose residuals
     are correlated between pixels. kernel: see kernels.py.
@@ -38,6 +40,8 @@ class RegisterOptions:
     min_inliers: float = 0.25
     score_ok: float = 0.6
     score_weak: float = 0.8
+    evidence: float = 5.5
+    evidence_scored: float = 4.0
     cell_floor_px: float = 0.1
     cell_max_px: float = 1.0
     cell_linear_px: float = 4.0

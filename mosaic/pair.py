@@ -1,8 +1,9 @@
 """Two pictures, one homography: `register`, for whoever has no clip and no camera, only two images.
 
 The direct estimator over all levels from a start or from identity; where that fails, again from phase correlation, from
-features, then from the shifts at which most pixels agree. Whatever the start, the result is the direct estimator's and
-has to pass its score.
+features, then from the shifts at which most pixels agree, and at last for a scene that only a minority of the pixels
+shows (minority.py). Whatever the start, the result is the direct estimator's and has to pass its score or, as a weak
+pair, show that the minority is a scene.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from mosaic.coords import normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
 from mosaic.gray import as_gray, as_mask, as_planes, white_of
 from mosaic.kernels import KernelName
+from mosaic.minority import CLEARLY_MORE, agreement, best_minority
 from mosaic.pyramid import Pyramid, build_pyramid, n_levels_for
 from mosaic.records import PAIR_REASONS, FloatArray, PairFit, PairStatus
-from mosaic.rescue import match_features, phase_correlation, small_gray
+from mosaic.rescue import match_features, phase_correlation, small_gray, weak_feature_starts
 from mosaic.rivals import shift_starts
 from mosaic.template import PreparedTemplate, SelectionOptions, build_template, prepare
 from mosaic.warp import HomographyFamily
@@ -31,6 +33,7 @@ REASONS = {
     **PAIR_REASONS,
     "asymmetric": "the pictures the other way round give another homography",
     "inconsistent": "too many parts of the picture were found elsewhere than the homography puts them",
+    "minority": "only a minority of the pixels agree, though in regions all over the overlap",
     "uncertain": "the pixels leave the homography open: the stated error of its anchors is large",
 }
 
@@ -104,8 +107,8 @@ def register(
 
     Returns PairFit with src = 0 (a), dst = 1 (b): H_dst_src maps px of a into b, det 1, NaN when failed. reason: a
     code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation', 'features',
-    'fine features' or 'shift', with ', blur matched' behind it where that was done; n_steps counts all that were
-    tried.
+    'fine features', 'shift' or 'minority' (minority.py), with ', blur matched' behind it where that was done; n_steps
+    counts all that were tried.
     Raises ValueError or TypeError for pictures, masks or a start of the wrong shape, type or value.
     """
     options = options or PairOptions()
@@ -184,7 +187,45 @@ def _best_of_starts(
             if fit.reason == "no_texture" and _n_pixels(prepared, 0) < enough:
                 return replace(best, n_steps=n_steps)
     assert best is not None  # identity is always tried
-    return replace(best, n_steps=n_steps)
+    if not options.rescue or _n_pixels(prepared, 0) < enough:
+        return replace(best, n_steps=n_steps)
+    found, steps = _of_minority(source, target, prepared, best, options)
+    return replace(found, n_steps=n_steps + steps)
+
+
+def _of_minority(
+    source: Pyramid, target: Pyramid, prepared: PreparedTemplate, best: PairFit, options: PairOptions
+) -> tuple[PairFit, int]:
+    """The best fit or, where more pixels agree with it, one that a minority of them holds; and the steps it took."""
+    small = _without_masked(source, FINE_PX), _without_masked(target, FINE_PX)
+    starts = weak_feature_starts(*small, source.size_px, target.size_px)
+    levels = (
+        (1, 0) if len(source.levels) > 1 and _n_pixels(prepared, 1) >= options.estimator.min_pixels else (0,)
+    )
+    before = best.H_dst_src if best.usable else None
+    answer = best_minority(prepared, target, starts, before, levels=levels, options=options.estimator)
+    if answer is None:
+        return best, 0
+    found, grey = answer
+    steps = found.n_steps
+    if not found.usable:
+        return best, steps
+    found = _judged(found, options)
+    if options.symmetric_px is not None:
+        reverse = prepare(
+            build_template(target, 1, options=options.selection), HomographyFamily(size_px=source.size_px)
+        )
+        found, more = _both_ways(found, reverse, source, options)
+        steps += more
+    now, then = (agreement(prepared, target, f, grey, options.estimator) for f in (found, best))
+    clearly = CLEARLY_MORE if _RANK[found.status] > _RANK[best.status] else 1.0
+    return (found if now > clearly * then else best), steps
+
+
+def _scaling(source: Pyramid, target: Pyramid) -> FloatArray:
+    """Area scaling of the one frame to the size of the other: identity for equal sizes."""
+    sx, sy = (t / s for s, t in zip(source.size_px, target.size_px, strict=True))
+    return np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
 
 
 def _ladders(route: str, levels: list[int]) -> list[list[int]]:
@@ -289,9 +330,7 @@ def _starts(
     options: PairOptions,
 ) -> Iterator[tuple[str, FloatArray]]:
     """Routes and their starts H_b_a, the cheap ones first; a later one is only made when it is asked for."""
-    # Area scaling of the one frame to the size of the other: identity for equal sizes.
-    sx, sy = (t / s for s, t in zip(source.size_px, target.size_px, strict=True))
-    scaling = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+    scaling = _scaling(source, target)
     if start is not None:
         yield "start", start
     yield "identity", normalise_homography(scaling)
