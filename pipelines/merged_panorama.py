@@ -13,14 +13,11 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.composite import Panorama, composite
-from mosaic.cropping import crop_inside
+from mosaic.composite import Panorama
 from mosaic.framestore import FrameStore, StoredFrame
-from mosaic.surface import choose_surface
-from mosaic.views import CompositeOptions, plan_views
 from pipelines.bridge import CameraPlacement
 from pipelines.config import Config
-from pipelines.shot import MAX_PLACEMENTS_FOR_SURFACE
+from pipelines.panorama import compose, plan_panorama
 
 
 class JoinedStores:
@@ -75,17 +72,10 @@ def panorama_of(
     progress: Callable[[float], None],
 ) -> Panorama:
     """The panorama of the stored frames under these placements. Raises ValueError: no stored frame has one."""
-    for store in stores:
-        store.cache_bytes = CACHE_BYTES // len(stores)
+    for one in stores:
+        one.cache_bytes = CACHE_BYTES // len(stores)
     joined = JoinedStores(stores)
-    options = CompositeOptions(views=config.panorama.views)
-    stride = max(1, len(placements) // MAX_PLACEMENTS_FOR_SURFACE)
-    surface = choose_surface(
-        placements[::stride], config.panorama.projection, max_pixels=config.panorama.max_megapixels * 1e6
-    )
     # Planned anew among what is stored: a place that many shots show needs no more views than any other.
-    plan = plan_views([p for p in placements if p.frame in joined], surface, options)
-    panorama = composite(
-        plan, cast(FrameStore, joined), placements, surface, options, scratch=scratch, progress=progress
-    )  # composite only reads
-    return crop_inside(panorama) if config.panorama.crop == "inside" else panorama
+    store = cast(FrameStore, joined)  # it is only read
+    plan = plan_panorama(placements, config, stored=store)
+    return compose(plan, store, placements, config, scratch, progress)

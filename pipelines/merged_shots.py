@@ -15,6 +15,7 @@ import numpy as np
 from mosaic.records import PairFit
 from pipelines.archive import to_json, write_arrays
 from pipelines.bridge import CameraPlacement
+from pipelines.camera_track import frame_poses, placements_of
 from pipelines.config import Config
 from pipelines.kept_shots import KeptShot, ShotShelf, rest
 from pipelines.links import contradicted_frames, without_doubtful
@@ -23,7 +24,7 @@ from pipelines.merging import Group, find_groups
 from pipelines.moments import trail
 from pipelines.output_folder import OutputFolder
 from pipelines.records import CameraTable, ShotRecord
-from pipelines.shot import CalibratedShot, frame_poses, placements_of
+from pipelines.shot import CalibratedShot
 from pipelines.shot_files import pair_arrays, panorama_facts, shot_record, write_panorama
 from pipelines.table import shot_rows
 

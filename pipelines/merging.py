@@ -28,7 +28,8 @@ from pipelines.config import Config
 from pipelines.kept_shots import KeptShot, ShotShelf
 from pipelines.keyframe_graph import KeyframeOptions, KeyframeResult, refine_keyframes, register_pairs
 from pipelines.pupil import with_pupil
-from pipelines.shot import believed_level, refine_options_of
+from pipelines.shot import believed_level
+from pipelines.shot_keyframes import refine_options_of
 from pipelines.shot_pairs import cross_pairs, spread
 
 SENTENCES = {
