@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mosaic.blend import solve_log_gains
 from mosaic.canvas import Canvas
 from mosaic.framestore import COARSE, FrameStore
+from mosaic.gains import solve_log_gains
 from mosaic.moving import find_still
 from mosaic.surface import Placement, Surface
 from mosaic.tile_maps import Scene

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.blend import Blended, blend_stack, sample_view
+from mosaic.blend import Blended, blend_stack
 from mosaic.canvas import Canvas
 from mosaic.framestore import eight_bits
+from mosaic.sampling import sample_view
 from mosaic.tile_maps import Scene, TileMap, fallback_maps, rows_reached, tile_maps
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.blend import gain_weights
+from mosaic.gains import gain_weights
 
 N_BLOCKS = 12  # of the panorama, left out in turn
 CERTAIN = 4.0  # times its own standard deviation: a coefficient below is held at 0
@@ -53,7 +53,7 @@ def solve_falloff(
     """(a, b) of the falloff from log intensities of the same points in many frames; zeros where none is certain.
 
     log_samples, weight, r2 (n, p): frame i at point j, weight 0 where not seen. block (p,): which of N_BLOCKS parts of
-    the scene a point belongs to. Minimises what blend.solve_log_gains does, with a r^2 + b r^4 beside the gains and
+    the scene a point belongs to. Minimises what gains.solve_log_gains does, with a r^2 + b r^4 beside the gains and
     the same prior on every unknown. Standard deviations come from leaving out the blocks in turn, because the errors of
     neighbouring points go together. Taken is r^2 and r^4 where the second is certain too, else r^2 alone; only what
     darkens all the way to the corner, and there by more than LEAST, is a lens.

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mosaic.blend import blend_stack, median_network, sample_view, solve_log_gains
+from mosaic.blend import blend_stack, median_network
+from mosaic.gains import solve_log_gains
+from mosaic.sampling import sample_view
 
 
 def sampled(
