@@ -172,6 +172,7 @@ def _best_of_starts(
             fit, _ = align(prepared, target, H, dst=1, levels=some, options=options.estimator, route=route)
             n_steps += fit.n_steps
             fit = _judged(fit, options)
+            alone = fit.info
             if fit.usable and options.symmetric_px is not None:
                 if reverse is None:
                     reverse = prepare(
@@ -182,7 +183,7 @@ def _best_of_starts(
                 n_steps += steps
             if best is None or _order(fit) < _order(best):
                 best = fit
-            if _is_sure(fit, options):
+            if _is_sure(replace(fit, info=alone), options):
                 return replace(best, n_steps=n_steps)
             if fit.reason == "no_texture" and _n_pixels(prepared, 0) < enough:
                 return replace(best, n_steps=n_steps)
@@ -284,7 +285,11 @@ def _judged(fit: PairFit, options: PairOptions) -> PairFit:
 def _both_ways(
     fit: PairFit, reverse: PreparedTemplate, source: Pyramid, options: PairOptions
 ) -> tuple[PairFit, int]:
-    """The fit, weak if b to a, started from its inverse, does not lead back; and the steps that took."""
+    """The fit, weak if b to a, started from its inverse, does not lead back; and the steps that took.
+
+    Its information is divided by d' info d / 8, d the distance of the anchors from where the way back puts them, if
+    that is over 1: a smear that is not the same in both pictures pulls the two ways apart, and no residual shows it.
+    """
     levels = [i for i in (1, 0) if _n_pixels(reverse, i) >= options.estimator.min_pixels]
     if not levels or options.symmetric_px is None:
         return fit, 0
@@ -295,6 +300,11 @@ def _both_ways(
     if back.reason in _NO_VERDICT:
         return fit, back.n_steps
     away = transfer(back.H_dst_src, transfer(fit.H_dst_src, fit.flow.src_px)) - fit.flow.src_px
+    if back.usable:
+        other = normalise_homography(np.linalg.inv(back.H_dst_src))
+        d = (transfer(fit.H_dst_src, fit.anchors_px) - transfer(other, fit.anchors_px)).ravel()
+        apart = float(d @ fit.info @ d) / len(d)
+        fit = replace(fit, info=fit.info / max(1.0, apart)) if np.isfinite(apart) else fit
     if back.usable and np.sqrt(np.mean(np.sum(away**2, axis=1))) <= options.symmetric_px * _scale_px(fit):
         return fit, back.n_steps
     return replace(fit, status=PairStatus.WEAK, reason="asymmetric"), back.n_steps

@@ -11,9 +11,11 @@ from mosaic.level import LevelPair, Linearised
 from mosaic.photometric import TUKEY
 from mosaic.records import N_CELLS, FloatArray
 
-# Error of a cell's place that all its pixels share (sampling, codec, crowd), px a grey level of residuals that agree:
-# the codec leaves more of both. Measured on 720p pairs; without it the mean of chi^2 / 8 is 4, at 8 Mbit/s 7.
-CELL_PX_PER_GREY = 0.009
+# Error of a cell's place that all its pixels share (sampling, crowd), px a grey level of residuals that agree. Without
+# it the mean of chi^2 / 8 of clean pairs is 3.8 (30 pairs at 360p, where the codec has its own term below).
+CELL_PX_PER_GREY = 0.004
+# Columns and rows of a grid four times as fine as the cells: how residuals are correlated is seen between the two.
+FINE_GRID = (32, 20)
 
 REGIONS, REGION_PIXELS = (16, 10), 15  # columns and rows; fewer pixels than that say nothing of a region
 
@@ -42,9 +44,7 @@ def regional_evidence(pair: LevelPair, fine: Linearised) -> float:
     """
     level, kernel = pair.pixels, pair.kernel
     columns, rows = REGIONS
-    w, h = pair.source.template.size_px
-    x, y = ((level.src_px + 0.5) * np.array([columns / w, rows / h])).astype(np.int64).T
-    region = np.clip(y, 0, rows - 1) * columns + np.clip(x, 0, columns - 1)
+    region = _grid(level.src_px, pair.source.template.size_px, REGIONS)
     shifts = _SHIFTS * max(1.0, pair.target.size_px[0] / 1280.0)
     shifted = kernel.shifted_residuals(
         *pair.picture, fine.dst, shifts, 1, level.values, pair.gain, pair.offset, *pair.masks
@@ -75,12 +75,25 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
     together. So the variance of the normal equations' right side is not sigma^2 N but what the 40 cells' own sums say
     it is (calibration.md 7.3): kappa = trace(N^-1 sum_c s_c s_c^T) / p, a mean over the p directions because 40 cells
     cannot tell them apart. To it comes CELL_PX_PER_GREY. Zeros where the pixels do not determine the anchors.
+
+    What an encoder copies is correlated over more than a cell, and the homography takes part of that with it: unseen.
+    Seen is how kappa grows from a grid four times as fine to the cells (1.1 on clean pairs, 2.3 at CRF 23 to 35). It
+    grows on up to the size of the picture, five to eight cells: the covariance is multiplied by its square.
     """
     level, kernel = pair.pixels, pair.kernel
     weight = kernel.robust_weights(fine.residual, np.float32(fine.sigma), True)
     N, _, _ = kernel.accumulate(fine.residual, fine.G, fine.J, weight)
     scores = kernel.cell_scores(fine.residual, fine.G, fine.J, weight, level.cell, N_CELLS)
     p = len(N)
+    columns, rows = FINE_GRID
+    small = kernel.cell_scores(
+        fine.residual,
+        fine.G,
+        fine.J,
+        weight,
+        _grid(level.src_px, pair.source.template.size_px, FINE_GRID),
+        columns * rows,
+    )
     n_cells = int(np.any(scores != 0, axis=1).sum())
     _, J, _ = pair.source.family.warp(state, pair.source.family.prepare(anchors))
     J8 = J.reshape(-1, p).astype(np.float64)
@@ -90,13 +103,26 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
     # What no residual shows: every cell as a whole may be off by some hundredths of a pixel.
     moments = kernel.cell_moments(fine.G, fine.J, weight, level.cell, N_CELLS)
     common = (CELL_PX_PER_GREY * fine.sigma) ** 2 * np.einsum("cak,cbk->ab", moments, moments)
-    # 2 n equations of p parameters: the sums at the optimum are smaller than the errors by that share.
-    share = 2 * n_cells / (2 * n_cells - p)
-    kappa = share * float(np.einsum("ca,ca->", scores, np.linalg.solve(N, scores.T).T)) / p
+    kappa, kappa_small = _kappa(scores, N), _kappa(small, N)
+    growth = max(1.0, kappa / kappa_small) if kappa_small > 0 else 1.0
     variance = max(kappa, fine.sigma**2)
     inverse = np.linalg.inv(N)
-    covariance = J8 @ (variance * inverse + inverse @ common @ inverse) @ J8.T
+    covariance = growth**2 * (J8 @ (variance * inverse + inverse @ common @ inverse) @ J8.T)
     # Anchors at the horizon of a wrong homography move by anything.
     if not np.isfinite(covariance).all() or not np.linalg.cond(covariance) < 1e14:
         return unknown
     return np.linalg.inv(covariance)
+
+
+def _kappa(scores: FloatArray, N: FloatArray) -> float:
+    """Variance of the normal equations' right side, in units of N, from the sums (c, p) of the cells of a grid."""
+    n, p = int(np.any(scores != 0, axis=1).sum()), len(N)
+    # 2 n equations of p parameters: the sums at the optimum are smaller than the errors by that share.
+    share = 2 * n / max(2 * n - p, 1)
+    return share * float(np.einsum("ca,ca->", scores, np.linalg.solve(N, scores.T).T)) / p
+
+
+def _grid(src_px: FloatArray, size_px: tuple[int, int], grid: tuple[int, int]) -> NDArray[np.int64]:
+    """Cell row * columns + column of a grid (columns, rows) over a picture, for points (n, 2)."""
+    x, y = ((src_px + 0.5) * np.array([grid[0] / size_px[0], grid[1] / size_px[1]])).astype(np.int64).T
+    return np.asarray(np.clip(y, 0, grid[1] - 1) * grid[0] + np.clip(x, 0, grid[0] - 1), np.int64)
