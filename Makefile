@@ -12,7 +12,8 @@ PYTEST_ARGS ?= -n 2 --dist loadfile
 
 BIN := .venv/bin
 STAMP := .venv/.installed
-TYPED := mosaic calib pipelines
+# A cold check takes 54 s of processor time, of which benchmarks and tests/synth are 6.
+TYPED := mosaic calib pipelines $(wildcard benchmarks/*.py) tests/synth
 
 # The viewer that a test opens our Deep Zoom tiles with (BSD). npm puts it beside the interpreter; without npm, or without
 # its registry, that one test is skipped.

@@ -59,7 +59,7 @@ def campaign(
 ) -> Campaign:
     """n kicks. f_px: focal length at 1920 px; it grows by a tenth while the ball flies."""
     rng = np.random.default_rng(seed)
-    rows = []
+    rows: list[list[float]] = []
     while len(rows) < n:
         row = _kick(rng, ball_px, click_px, focal_std, f_px)
         if row is not None:
@@ -152,7 +152,7 @@ def _visible(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--n", type=int, default=400)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

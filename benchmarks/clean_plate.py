@@ -85,7 +85,7 @@ def true_picture(clip: SynthClip, run: Path) -> Truth:
         at, frame = placed[k].ray_to_pixel(nodes), clip.frame(k)
         clear[k] = ~frame.player_mask & ~frame.overlay_mask
         height, width = frame.player_mask.shape
-        known = np.isfinite(at).all(axis=-1)
+        known = np.asarray(np.isfinite(at).all(axis=-1))
         at = np.where(known[..., None], at, -1e5)
         off = np.abs(at / [(width - 1) / 2, (height - 1) / 2] - 1).max(axis=-1)
         share = np.where(

@@ -95,7 +95,7 @@ def figures(
     """The row's figures, and the picture with its gain taken off."""
     where = seen & common & np.isfinite(target).all(axis=-1)
     gain = [np.median(target[where][:, i] / np.maximum(image[where][:, i], 8)) for i in range(3)]
-    levelled = np.clip(image * np.array(gain, np.float32), 0, 255)
+    levelled = np.clip(image.astype(np.float32) * np.array(gain, np.float32), 0, 255)
     error = levelled - np.nan_to_num(target)
     five = where & truth.passed & (truth.n_clear >= FIVE)
     result = {

@@ -89,12 +89,12 @@ def opencv(surface: Surface, views: Iterator[tuple[Picture, NDArray[np.float32]]
     corners = [(0, 0)] * len(pictures)
     # One gain per frame and channel: gains of blocks, its default, need 11 GiB for these sizes (a dense matrix).
     compensator = detail.ExposureCompensator_createDefault(detail.ExposureCompensator_CHANNELS)
-    compensator.feed(corners, [cv2.UMat(p) for p in pictures], [cv2.UMat(m) for m in masks])
+    compensator.feed(corners, [_umat(p) for p in pictures], [_umat(m) for m in masks])
     # Seams at a third of the size, as the stitcher does: a graph cut over all pixels takes minutes.
     size = (surface.width // 3, surface.height // 3)
     finder = detail.GraphCutSeamFinder("COST_COLOR")
-    small = [cv2.UMat(cv2.resize(p, size, interpolation=cv2.INTER_AREA).astype(np.float32)) for p in pictures]
-    small_masks = [cv2.UMat(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST)) for m in masks]
+    small = [_umat(cv2.resize(p, size, interpolation=cv2.INTER_AREA).astype(np.float32)) for p in pictures]
+    small_masks = [_umat(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST)) for m in masks]
     cut = finder.find(small, corners, small_masks)
     blender = detail.MultiBandBlender()
     blender.setNumBands(5)
@@ -102,10 +102,16 @@ def opencv(surface: Surface, views: Iterator[tuple[Picture, NDArray[np.float32]]
     for i, (picture, mask) in enumerate(zip(pictures, masks, strict=True)):
         levelled = compensator.apply(i, (0, 0), picture, mask)
         levelled = picture if levelled is None else np.asarray(levelled)
-        part = cv2.resize(cv2.dilate(cut[i].get(), None), (surface.width, surface.height))
+        part = cv2.resize(
+            cv2.dilate(cut[i].get(), np.ones((3, 3), np.uint8)), (surface.width, surface.height)
+        )
         blender.feed(levelled.astype(np.int16), cv2.bitwise_and(part, mask), (0, 0))
     image, seen = blender.blend(None, None)
     return np.clip(image, 0, 255).astype(np.uint8), np.asarray(seen) > 0
+
+
+def _umat(picture: NDArray[Any]) -> cv2.UMat:
+    return cv2.UMat(picture)  # type: ignore[call-overload]  # OpenCV takes arrays; its types do not say so
 
 
 def hugin(

@@ -61,7 +61,10 @@ def boat(folder: Path) -> tuple[Array, tuple[int, int]]:
         storage = cv2.FileStorage(str(folder / f"H1to{k}p.xml"), cv2.FILE_STORAGE_READ)
         H.append(storage.getFirstTopLevelNode().mat())
         storage.release()
-    height, width = cv2.imread(str(folder / "img1.png")).shape[:2]
+    first = cv2.imread(str(folder / "img1.png"))
+    if first is None:
+        raise FileNotFoundError(folder / "img1.png")
+    height, width = first.shape[:2]
     return np.array(H), (width, height)
 
 

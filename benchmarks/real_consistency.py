@@ -91,7 +91,9 @@ def main() -> None:
     parser.add_argument("--stand-rows", type=float, default=0.23, help="share of the picture's height")
     arguments = parser.parse_args()
     with av.open(str(arguments.clip)) as source:
-        pictures = [frame.to_ndarray(format="yuv420p") for frame in source.decode(video=0)]
+        pictures = [
+            np.asarray(frame.to_ndarray(format="yuv420p"), np.uint8) for frame in source.decode(video=0)
+        ]
     height = pictures[0].shape[0] * 2 // 3
     config = Config.model_validate({"panorama": {"enabled": False}})
     print(

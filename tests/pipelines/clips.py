@@ -8,6 +8,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 
@@ -37,6 +38,7 @@ def write_clip(
     """n pictures; `pictures` are RGB (h, w, 3) or the luma (h, w) as it shall be stored; pts in frames."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=fps, options=options or {})
+        assert isinstance(stream, VideoStream)
         w, h = size
         stream.width, stream.height, stream.pix_fmt = w, h, pix_fmt
         stream.time_base = 1 / fps
@@ -44,9 +46,9 @@ def write_clip(
             stream.codec_context.sample_aspect_ratio = sar
         for key, value in (colour or {}).items():
             setattr(stream.codec_context, key, value)
-        for key, value in (metadata or {}).items():
-            stream.metadata[key] = value
-            container.metadata[key] = value
+        for key, text in (metadata or {}).items():
+            stream.metadata[key] = text
+            container.metadata[key] = text
         if rotation:
             stream.set_display_rotation(rotation)
         for i in range(n):
@@ -71,7 +73,7 @@ def _video(picture: NDArray[Any], pix_fmt: str) -> av.VideoFrame:
         sample = np.dtype("<u2") if deep else np.dtype(np.uint8)
         rows = np.zeros((plane.height, plane.line_size // sample.itemsize), sample)
         rows[:, : plane.width] = picture if number == 0 else (512 if deep else 128)
-        plane.update(rows)
+        plane.update(rows.tobytes())
     return frame
 
 

@@ -40,9 +40,10 @@ def fit(
 
 def test_a_chain_is_the_product_of_its_steps_with_each_step_s_error_added():
     chain = Chain().followed(fit(0, 1, shift(5)), fit(0, 1, shift(5)))
-    assert (chain.n_composed, chain.fit.route) == (0, "predicted")
+    assert chain.fit is not None and (chain.n_composed, chain.fit.route) == (0, "predicted")
     turned = normalise_homography(np.array([[0.99, -0.02, 3.0], [0.02, 0.99, 1.0], [1e-5, 0, 1]]))
     chain = chain.followed(None, fit(1, 2, turned)).followed(None, fit(2, 3, shift(2)))
+    assert chain.fit is not None
     assert (chain.fit.src, chain.fit.dst, chain.fit.route, chain.n_composed) == (0, 3, "composed", 2)
     np.testing.assert_allclose(
         chain.H_frame_keyframe, normalise_homography(shift(2) @ turned @ shift(5)), atol=1e-12

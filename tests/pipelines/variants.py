@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from tests.pipelines.end_to_end import SIZE, Finished, run, small_spec
@@ -34,7 +35,7 @@ def fine_clip(folder: Path) -> Path:
 def read_pictures(path: Path) -> list[NDArray[np.uint8]]:
     """RGB of all pictures of a file."""
     with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        return [np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in container.decode(video=0)]
 
 
 def plain(fine: list[NDArray[np.uint8]]) -> Pictures:
@@ -107,6 +108,7 @@ def write_variant(name: str, fine: list[NDArray[np.uint8]], folder: Path) -> Pat
         options = {**options, "x264-params": "tff=1:log-level=none"}
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=FPS, options=options)
+        assert isinstance(stream, VideoStream)
         pictures = make(fine)
         stream.height, stream.width = pictures[0][0].shape[:2]
         stream.pix_fmt = pix_fmt

@@ -17,6 +17,7 @@ from typing import Any
 import av
 import av.filter
 import numpy as np
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from pipelines.decode import Clip, open_clip
@@ -235,7 +236,7 @@ def video_frame(grey: NDArray[np.float64], pix_fmt: str) -> av.VideoFrame:
         rows = np.full((plane.height, plane.line_size // sample.itemsize), neutral, sample)
         if number == 0:
             rows[:, :w] = stored
-        plane.update(rows)
+        plane.update(rows.tobytes())
     return frame
 
 
@@ -245,6 +246,7 @@ def make(case: Case, folder: Path) -> Path:
     w, h = case.size
     with av.open(str(path), "w") as container:
         stream = container.add_stream(case.codec, rate=case.fps, options=dict(case.options))
+        assert isinstance(stream, VideoStream)
         stream.width, stream.height, stream.pix_fmt = w, h, case.pix_fmt
         stream.codec_context.thread_count = 1
         context = stream.codec_context
@@ -279,7 +281,7 @@ def make(case: Case, folder: Path) -> Path:
 def _field_marker(case: Case) -> av.filter.Graph:
     graph = av.filter.Graph()
     source = graph.add_buffer(
-        width=case.size[0], height=case.size[1], format=case.pix_fmt, time_base=1 / case.fps
+        width=case.size[0], height=case.size[1], format=av.VideoFormat(case.pix_fmt), time_base=1 / case.fps
     )
     mark = graph.add("setfield", case.flags)
     sink = graph.add("buffersink")
