@@ -25,6 +25,10 @@ from calib.systematic import systematic_px
 Array = NDArray[np.float64]
 
 MAX_POSE_STEPS = 15
+SETTLED_DECREMENT = 1e-2  # Newton decrement: a tenth of a step's standard deviation, squared
+MAX_LOG_F_STEP, MAX_TURN_RAD = 0.3, 0.2  # of one step
+# The previous frame's edge alone is trusted for the velocity while it stays this near to all edges together.
+ALONE_LOG_F, ALONE_TURN_RAD = 0.1, 0.05
 FAR_SCALE = 100.0  # robust residual scale, in stated sigmas (10 px), from which a guess is not worth refining
 
 SENTENCES = {
@@ -46,7 +50,8 @@ class RunningOptions:
     keep_frames: recent poses kept so that edges may name them. max_keyframes: the oldest but the first are forgotten
     beyond it, so that memory and work stay bounded however long the shot.
     two_view_motion, two_view_growth: rms motion in widths, and its growth since, at which the first keyframe and the
-    newest frame are calibrated from scratch while there is no second keyframe (.1 s each).
+    newest frame are calibrated from scratch while there is no second keyframe (.1 s each). max_sigma: total relative
+    focal error up to which the focal may be used (`ready`).
     """
 
     window: int = 24
@@ -216,6 +221,7 @@ class RunningCalibrator:
         return [f for f in self._keyframes if f in chosen]
 
     def _adjust(self) -> None:
+        """Refine the window's keyframes; older ones follow the common focal, and the oldest are forgotten."""
         window = self._window()
         members = set(window)
         edges = tuple(e for e in self._edges if e.a in members and e.b in members)
@@ -267,6 +273,7 @@ class RunningCalibrator:
         return replace(solution, R=solution.R @ turn)
 
     def _score(self, solution: Solution, graph: HomographyGraph) -> None:
+        """Take over the errors of a solution: statistical, of zoom, and systematic (10 % x s_px / S10)."""
         s_px = systematic_px(solution, graph, self.options.gates)["systematic_px"]
         self._systematic = 0.1 * s_px / solution.s10_px if solution.s10_px > 0 else math.inf
         sigma = solution.sigma_mean_log_f
@@ -313,6 +320,9 @@ class RunningCalibrator:
         return [e for e, other in mine if other in self._poses or other in self._recent]
 
     def _solve(self, frame: int, edges: Sequence[HomographyEdge]) -> tuple[_Pose, float, _Pose | None] | None:
+        """The frame's pose against held ones, its own error of log f, and its pose by the previous frame alone.
+
+        None: too few measurements, no convergence, or residuals beyond options.max_scale."""
         others = sorted({e.b if e.a == frame else e.a for e in edges})
         graph = HomographyGraph(frames=np.array([*others, frame]), edges=tuple(edges), size_px=self.size_px)
         packed = pack(graph)
@@ -348,9 +358,10 @@ class RunningCalibrator:
                 step = np.linalg.solve(normal, right)
             except np.linalg.LinAlgError:
                 return None
-            # Newton decrement: a step of a tenth of its standard deviation is taken and not looked at again.
-            settled = float(step @ right) < 1e-2
-            step = step / max(1.0, abs(step[0]) / 0.3, float(np.abs(step[1:]).max()) / 0.2)
+            # A step so small is taken and not looked at again.
+            settled = float(step @ right) < SETTLED_DECREMENT
+            turn = float(np.abs(step[1:]).max())
+            step = step / max(1.0, abs(step[0]) / MAX_LOG_F_STEP, turn / MAX_TURN_RAD)
             move = np.zeros((1, row + 1, 4))
             move[0, row] = step
             state = state.moved(move, np.zeros_like(shared))
@@ -384,7 +395,7 @@ class RunningCalibrator:
             step = np.linalg.solve(lin.blocks[0, k][part, part], lin.gradient[0, k][part])
         except np.linalg.LinAlgError:
             return None
-        if abs(step[0]) > 0.1 or np.abs(step[1:]).max() > 0.05:
+        if abs(step[0]) > ALONE_LOG_F or np.abs(step[1:]).max() > ALONE_TURN_RAD:
             return None
         return _Pose(float(state.log_f[0, row] + step[0]), rotation.exp(step[1:]) @ state.R[0, row])
 
@@ -404,7 +415,7 @@ class RunningCalibrator:
         return _Pose(log_f, R) if np.isfinite(log_f) and np.isfinite(R).all() else None
 
     def _two_view(self, frame: int, edges: Sequence[HomographyEdge]) -> None:
-        """Before a second keyframe: calibrate (first keyframe, this frame), again when the motion grew by a quarter."""
+        """Before a second keyframe: calibrate (first keyframe, this frame), again as the motion grows."""
         key = self._keyframes[0]
         mine = tuple(e for e in edges if {e.a, e.b} == {key, frame})
         if not mine:

@@ -22,9 +22,9 @@ from calib.problem import Linearised, Loss, Packed, PriorTerms, State, linearise
 from calib.selected_inverse import DenseCovariance, SelectedCovariance
 
 Array = NDArray[np.float64]
-DENSE_BELOW = 600
-MAX_LOG_F_STEP = 0.5
-MAX_ROTATION_STEP = 0.3
+DENSE_BELOW = 600  # pose unknowns, four a frame
+MAX_LOG_F_STEP = 0.5  # of one step
+MAX_ROTATION_STEP = 0.3  # rad, of one step
 
 
 class Layout:

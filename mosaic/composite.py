@@ -29,6 +29,7 @@ from mosaic.vignetting import N_BLOCKS, NONE, corner, log_falloff, radius_square
 __all__ = ["Canvas", "CompositeOptions", "FrameStore", "Panorama", "ViewPlan", "composite", "plan_views"]
 
 STRIP_ROWS = 1024  # of a picture that are looked at together
+DARK_GREY, BURNT_GREY = 8, 247  # beyond them a gain does not act as a factor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -153,8 +154,8 @@ def solve_light(
 ) -> Light:
     """What makes the views agree, from the coarse pictures.
 
-    Dark (below 8) and burnt (above 247) blocks are left out: there a gain does not act as a factor. The falloff is
-    the same for all channels.
+    store, views, surface: as of `composite`; n_points: of the panorama that are looked at. Dark and burnt blocks are
+    left out. The falloff is the same for all channels.
     """
     lattice = lattice_of(surface, n_points)
     samples = np.zeros((3, len(views), len(lattice.rays)), np.float32)
@@ -170,7 +171,7 @@ def solve_light(
         if not inside.any() or min(width, height) < 2:
             continue
         value, sure = _coarse_samples(picture, trust, at[inside])
-        usable = sure * ((value > 8) & (value < 247)).all(axis=-1)
+        usable = sure * ((value > DARK_GREY) & (value < BURNT_GREY)).all(axis=-1)
         samples[:, row, inside] = np.log(np.maximum(value, 1.0)).T
         weight[row, inside] = usable
         r2[row, inside] = radius_squared(xy[inside], placement.size_px)
