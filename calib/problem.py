@@ -157,8 +157,8 @@ class State:
     def moved(self, frames: Array, shared: Array) -> State:
         """Steps (S, n, 4) and (S, 5 or 8) applied: rotations from the left, made orthonormal again.
 
-        Pixels show a focal length times an angle: the data's flat valley is angle = constant / f, and a straight step of
-        d in the mean log f leaves it by d^2 / 2 of the angles. Turned by (1 - exp(-d)) / d as far, it stays in; small
+        Pixels show a focal length times an angle: the data's flat valley is angle = constant / f. A straight step of d
+        in the mean log f leaves it by d^2 / 2 of the angles; turned by (1 - exp(-d)) / d as far, it stays in. Small
         steps are the same.
         """
         mean = frames[..., 0].mean(-1)[:, None, None]
