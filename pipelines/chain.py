@@ -28,6 +28,10 @@ class Chain:
         """(3, 3) px of the keyframe to px of the newest frame."""
         return np.eye(3) if self.fit is None else self.fit.H_dst_src
 
+    def H_since(self, before: Chain) -> FloatArray:
+        """(3, 3) px of the frame that `before`, a chain to the same keyframe, ends at to px of the newest frame."""
+        return normalise_homography(self.H_frame_keyframe @ np.linalg.inv(before.H_frame_keyframe))
+
     def followed(self, direct: PairFit | None, step: PairFit | None) -> Chain:
         """The chain to the next frame. direct: keyframe to it; step: newest frame to it; usable ones, None if none."""
         if direct is not None:

@@ -109,7 +109,8 @@ def recover(look: PreparedFrame, known: Known, options: RegisterOptions) -> Reac
             prepare(template, family), look.pyramid, H, dst=look.frame, options=options, route=route
         )
         if fit.usable:
-            stopped = replace(known.motion, H_step=np.eye(3), log_zoom=0.0, turn=np.eye(3))
+            # What is predicted from here on is a standstill: it may miss by anything.
+            stopped = replace(known.motion, H_step=np.eye(3), log_zoom=0.0, turn=np.eye(3), missed_px=np.inf)
             return Reached(fits=(fit,), motion=stopped)
     return Reached(fits=(), motion=known.motion)
 

@@ -125,8 +125,10 @@ class ShotTracker:
         if self.trusts_camera and np.isfinite(estimate.log_f):
             self._pose = CameraPose(log_f=estimate.log_f, R=estimate.R)
         step, direct = _first_from(previous.frame, fits), _first_from(self._current, fits)
-        self._chain = self._chain.followed(direct, step)
-        moved_px, _ = centre_motion(self._motion.H_step if step is None else step.H_dst_src, self.size_px)
+        before, self._chain = self._chain, self._chain.followed(direct, step)
+        moved_px, _ = centre_motion(
+            step.H_dst_src if step is not None else self._chain.H_since(before), self.size_px
+        )
         self._observe(look, "ok", "", moved_px, estimate)
         if step is not None:
             self._screen.look(previous.template, look.pyramid, step, self.register_options.kernel)

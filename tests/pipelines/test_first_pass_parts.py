@@ -57,6 +57,8 @@ def test_a_direct_pair_ends_a_chain_and_without_any_pair_it_stays():
     assert chain.followed(None, None) is chain
     again = chain.followed(fit(0, 3, shift(14)), fit(2, 3, shift(5)))
     assert again.n_composed == 0 and again.H_frame_keyframe[0, 2] == 14
+    # The motion since the frame before, where only the pair with the keyframe held.
+    np.testing.assert_allclose(again.H_since(chain), shift(4), atol=1e-12)
 
 
 def test_motion_of_the_centre_is_its_shift_and_the_scale_there():
