@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from pipelines.cli_logging import set_up_logging
 from pipelines.cli_results import complete_names, format_names, print_json, register
 from pipelines.cli_runs import RunResult, exit_code
 from pipelines.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, InputError, UserError
-from pipelines.stills import is_pattern
+from pipelines.stills import is_pattern, is_there
 
 if TYPE_CHECKING:
     from pipelines.config import Config
@@ -262,7 +263,7 @@ def _run_one(clip: Path, out: Path, config: Config, resume: bool, quiet: bool) -
         from pipelines.stdin import spooled
 
         given = spooled(sys.stdin.buffer, out, int(config.decode.stdin_max_gb * 1e9))
-    elif not clip.exists() and not is_pattern(clip):
+    elif not is_there(clip) and not is_pattern(clip):
         # Before the seconds that the heavy imports take.
         raise InputError(clip, "no such file", "check the path")
     from pipelines.run import process
@@ -334,7 +335,13 @@ def _probe(
             sys.stdin.buffer, Path(tempfile.gettempdir()), int(settings.decode.stdin_max_gb * 1e9)
         )
     with TerminalProgress(show=not quiet) as progress, given as path:
-        facts = probe(path, settings, shots=shots, seconds=seconds or None, progress=progress)
+        facts = probe(
+            path,
+            settings,
+            shots=shots,
+            seconds=seconds if 0 < seconds < math.inf else None,
+            progress=progress,
+        )
     if as_json:
         print_json({"exit_code": EXIT_OK, **facts})
     else:

@@ -17,6 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pipelines.errors import ConfigError
 from pipelines.exports import formats
 
+# A year at 50 pictures/s has 1.6e9. What counts pictures is bounded, because iterators take no more than 2**63.
+MOST_PICTURES = 10**12
+
 
 class Section(BaseModel):
     """A frozen group of settings; an unknown key is an error, and so are infinities and NaN."""
@@ -189,7 +192,8 @@ class CalibrationOptions(Section):
 
     focal_px: float | None = Field(
         default=None,
-        gt=0,
+        ge=1,
+        le=1e8,
         description=(
             "px of the frame as decoded: a focal length known from elsewhere; none = self-calibrated"
         ),
@@ -197,11 +201,13 @@ class CalibrationOptions(Section):
     focal_frame: int | None = Field(
         default=None,
         ge=0,
+        le=MOST_PICTURES,
         description=("picture at which focal_px holds; none = the reference frame of each shot"),
     )
     focal_std_px: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-3,
+        le=1e8,
         description=(
             "px; one-sigma error of focal_px; none = 2 % of it, about what a lens scale or a pitch fit gives"
         ),
@@ -362,9 +368,11 @@ class RunOptions(Section):
     resume: bool = Field(
         default=False, description=("keep the shots that an interrupted run in the same folder finished")
     )
-    start_frame: int = Field(default=0, ge=0, description="first output picture that is used; counted from 0")
+    start_frame: int = Field(
+        default=0, ge=0, le=MOST_PICTURES, description="first output picture that is used; counted from 0"
+    )
     max_frames: int | None = Field(
-        default=None, ge=2, description=("pictures used from there; none = to the end")
+        default=None, ge=2, le=MOST_PICTURES, description="pictures used from there; none = to the end"
     )
 
 
@@ -474,7 +482,7 @@ def _validate(data: Mapping[str, Any], source: str, from_command_line: frozenset
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark before the first line
     except FileNotFoundError:
         raise ConfigError(path, "no such file", "check the path") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -485,6 +493,8 @@ def _read(path: Path) -> dict[str, Any]:
         data = json.loads(text)
     except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
         raise ConfigError(path, f"not valid ({error})", "mend that line") from None
+    except (ValueError, RecursionError):  # a number of thousands of digits, brackets thousands deep
+        raise ConfigError(path, "not valid (no settings file holds this)", "give another file") from None
     if not isinstance(data, dict) or not isinstance(data.get("config"), dict):
         raise ConfigError(
             path, "holds no configuration", "give a run.json written by broadcast-mosaic, or a TOML file"

@@ -76,8 +76,8 @@ class OutputFolder:
         self._made = False
 
     def __enter__(self) -> Self:
-        self._made = not self.out.exists()
         try:
+            self._made = not self.out.exists()
             self.out.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError):
             raise OutputError(self.out, "is a file, not a folder", "choose another folder with -o") from None

@@ -221,6 +221,8 @@ def read_mask(path: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     Raises ConfigError: unreadable, another size, all of it covered.
     """
     try:
+        if Path(path).exists() and not (Path(path).is_file() or Path(path).is_dir()):  # bytes without end
+            raise ConfigError(path, "is a pipe or a device", "give a PNG of the clip's size, white = scene")
         coded = np.frombuffer(Path(path).read_bytes(), np.uint8)
     except OSError as error:
         raise ConfigError(path, f"cannot be read ({error.strerror})", "check the path") from None

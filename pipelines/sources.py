@@ -18,7 +18,7 @@ from pipelines.config import DecodeOptions
 from pipelines.deinterlace import deinterlace
 from pipelines.errors import InputError
 from pipelines.picture import Picture
-from pipelines.stills import IMAGE_SUFFIXES, is_pattern, list_images
+from pipelines.stills import IMAGE_SUFFIXES, is_pattern, is_there, list_images
 from pipelines.telecine import undo_telecine
 from pipelines.timing import Timecode
 
@@ -65,7 +65,8 @@ class Source(Protocol):
 
 def open_source(path: Path, options: DecodeOptions) -> Source:
     """A container or images, by what the path is. Raises InputError with file, cause and cure."""
-    if path.is_dir() or is_pattern(path):
+    there = is_there(path)
+    if (there and path.is_dir()) or is_pattern(path):
         files = list_images(path)
         if not files:
             cause = "no images in it" if path.is_dir() else "no file matches the pattern"

@@ -32,10 +32,11 @@ def spooled(stream: IO[bytes], folder: Path, limit_bytes: int) -> Iterator[Path]
     """
     if stream.isatty():
         raise InputError(STDIN, "standard input is a terminal", "pipe a clip in, or name a file")
-    made = not folder.exists()
+    made = False
     path: Path | None = None
     try:
         try:
+            made = not folder.exists()
             folder.mkdir(parents=True, exist_ok=True)
             _remove_stale(folder)
             handle, name = tempfile.mkstemp(prefix=SPOOL, dir=folder)
@@ -51,7 +52,7 @@ def spooled(stream: IO[bytes], folder: Path, limit_bytes: int) -> Iterator[Path]
         except (FileExistsError, NotADirectoryError):
             raise OutputError(folder, "is a file, not a folder", "choose another folder with -o") from None
         except OSError as error:
-            if error.errno not in (*NO_ROOM, errno.EACCES):
+            if error.errno not in (*NO_ROOM, errno.EACCES, errno.ENAMETOOLONG):
                 raise
             cause = f"standard input could not be stored there ({error.strerror})"
             raise OutputError(folder, cause, "make room, or choose another folder with -o") from None

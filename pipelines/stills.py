@@ -1,4 +1,4 @@
-"""Image sequences: which files a folder or a pattern stands for, in which order. Nothing is opened."""
+"""What the name of a clip stands for: a file, a folder or a pattern of images, in which order. Nothing is opened."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import fnmatch
 import re
 from pathlib import Path
 from typing import Any
+
+from pipelines.errors import InputError
 
 IMAGE_SUFFIXES = (
     ".png",
@@ -24,9 +26,26 @@ IMAGE_SUFFIXES = (
 _COUNTER = re.compile(r"%0?\d*d")
 
 
+def is_there(path: Path) -> bool:
+    """Whether a file or a folder has that name.
+
+    Raises InputError: the system does not take the name or let us look; a pipe or a device, which cannot be read twice.
+    """
+    try:
+        there = path.exists()
+    except OSError as error:
+        raise InputError(path, f"cannot be looked at ({error.strerror})", "check the path") from None
+    if "\0" in str(path):
+        raise InputError(path, "no file has such a name (it holds a zero byte)", "check the path")
+    if there and not (path.is_file() or path.is_dir()):
+        cause = "is a pipe or a device, and a clip is read more than once"
+        raise InputError(path, cause, "give it on standard input and - as the clip")
+    return there
+
+
 def is_pattern(path: Path) -> bool:
     """Whether a path stands for many images: frames/%06d.png or frames/*.png. A file of just that name is that file."""
-    return bool(_COUNTER.search(path.name) or any(sign in path.name for sign in "*?[")) and not path.exists()
+    return bool(_COUNTER.search(path.name) or any(sign in path.name for sign in "*?[")) and not is_there(path)
 
 
 def list_images(path: Path) -> list[Path]:
@@ -48,7 +67,7 @@ def list_images(path: Path) -> list[Path]:
         found = [p for p in images if fnmatch.fnmatchcase(p.name, path.name)]
 
     def numbers(p: Path) -> list[Any]:
-        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)]
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", p.name)]
 
     return sorted(found, key=numbers)
 

@@ -101,7 +101,11 @@ def _read_only(folder: Path) -> Path:
     return folder / "locked" / "out"
 
 
-@pytest.mark.parametrize("make", [_below_a_file, _a_file, _read_only])
+def _long(folder: Path) -> Path:
+    return folder / ("a" * 300)
+
+
+@pytest.mark.parametrize("make", [_below_a_file, _a_file, _read_only, _long])
 def test_unwritable_output_is_one_line_before_any_work(
     pan_clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], make: Callable[[Path], Path]
 ) -> None:

@@ -164,6 +164,7 @@ def test_a_users_mistake_is_one_line_and_exit_2(
         "Missing option": ["run", good],
         "No such option": ["run", good, *out, "--resum"],
         "No such command": ["rum", good],
+        "name too long": ["run", str(tmp_path / ("a" * 300)), *out],
         "no such file; check": ["run", good, *out, "--config", str(tmp_path / "none.toml")],
         "finished run": ["compare", str(tmp_path / "nowhere"), good],
         "has no settings": ["compare", good, good, "--shots.min_frames", "3"],

@@ -44,6 +44,11 @@ def test_every_setting_has_a_reason_and_is_in_the_help() -> None:
             assert field.description and len(field.description) > 20, f"{section}.{key}"
 
 
+def test_a_byte_order_mark_before_the_settings_does_no_harm(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("\ufeff[shots]\nmin_frames = 5\n", encoding="utf-8")
+    assert load_config(tmp_path / "a.toml").shots.min_frames == 5
+
+
 def test_config_is_frozen() -> None:
     with pytest.raises(ValidationError):
         Config().shots.min_frames = 3  # type: ignore[misc]
@@ -81,6 +86,10 @@ def test_command_line_wins_over_the_file_and_is_typed(tmp_path: Path) -> None:
         (["--registration.kernel", "cuda"], "'numba' or 'torch'"),
         (["--decode.image_fps", "nan"], "--decode.image_fps"),
         (["--calibration.focal_std_px", "5"], "without focal_px"),
+        (["--calibration.focal_px", "350", "--calibration.focal_std_px", "1e-300"], "greater than or equal"),
+        (["--calibration.focal_px", "1e300"], "less than or equal"),
+        (["--run.max_frames", "9" * 25], "less than or equal"),
+        (["--run.start_frame", "9" * 25], "less than or equal"),
     ],
 )
 def test_a_wrong_option_is_named_with_its_cure(args: list[str], said: str) -> None:
@@ -98,6 +107,10 @@ def test_a_wrong_option_is_named_with_its_cure(args: list[str], said: str) -> No
         ("run.json", "{}", "no configuration"),
         ("run.json", "{", "not valid"),
         ("missing.toml", None, "no such file"),
+        ("digits.toml", f"[run]\nmax_frames = {'1' * 5000}\n", "not valid"),
+        ("digits.json", f'{{"config": {{"run": {{"max_frames": {"1" * 5000}}}}}}}', "not valid"),
+        ("deep.toml", "a = " + "[" * 5000, "not valid"),
+        ("deep.json", "[" * 100000, "not valid"),
     ],
 )
 def test_a_wrong_file_is_named_with_its_cure(tmp_path: Path, name: str, text: str | None, said: str) -> None:

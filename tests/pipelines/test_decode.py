@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 from fractions import Fraction
 from itertools import pairwise
@@ -16,6 +17,7 @@ from pipelines.config import DecodeOptions
 from pipelines.decode import Clip, Frame, open_clip
 from pipelines.errors import InputError
 from pipelines.picture import Picture
+from pipelines.stills import list_images
 from pipelines.timing import PtsRepair, Timecode
 from tests.pipelines.clips import ramp, write_audio, write_clip
 
@@ -234,6 +236,12 @@ def test_image_folder_and_pattern_in_order_of_number(tmp_path: Path) -> None:
         assert frames[10].pts_s == pytest.approx(0.2)
 
 
+def test_digits_that_are_no_decimals_do_not_upset_the_order_of_images(tmp_path: Path) -> None:
+    for name in ("1²2.png", "1²10.png", "x.png"):
+        (tmp_path / name).touch()
+    assert [p.name for p in list_images(tmp_path)] == ["1²2.png", "1²10.png", "x.png"]
+
+
 def test_second_pass_and_ranges_give_the_same_pictures(tmp_path: Path) -> None:
     with open_clip(write_clip(tmp_path / "a.mkv", 12)) as clip:
         everything = list(clip)
@@ -299,6 +307,7 @@ def broken_inputs(folder: Path) -> dict[str, tuple[Path, str]]:
     (folder / "folder").mkdir()
     (folder / "noise.mp4").write_bytes(np.random.default_rng(1).bytes(5000))
     (folder / "list.mp4").write_text("ffconcat version 1.0\nfile whole.mp4\n")
+    os.mkfifo(folder / "pipe.mp4")  # with nobody at its other end: opening it would wait for ever
     return {
         "missing": (folder / "none.mp4", "no such file"),
         "text": (text, "text"),
@@ -311,6 +320,9 @@ def broken_inputs(folder: Path) -> dict[str, tuple[Path, str]]:
         "no match": (folder / "folder" / "%04d.png", "no file matches"),
         "one frame": (write_clip(folder / "one.mkv", 1), "only one picture"),
         "indirect": (folder / "list.mp4", "list of other files"),
+        "pipe": (folder / "pipe.mp4", "pipe or a device"),
+        "long name": (folder / f"{'a' * 300}.mp4", "name too long"),
+        "zero byte": (folder / "a\0b.mp4", "zero byte"),
     }
 
 
@@ -326,6 +338,9 @@ KINDS = (
     "no match",
     "one frame",
     "indirect",
+    "pipe",
+    "long name",
+    "zero byte",
 )
 
 
@@ -334,7 +349,8 @@ def test_unusable_input_names_file_cause_and_cure_in_one_line(tmp_path: Path, ki
     path, cause = broken_inputs(tmp_path)[kind]
     with pytest.raises(InputError) as caught:
         decode(path)
-    assert cause in caught.value.cause and path.name in str(caught.value) and caught.value.cure
+    assert cause in caught.value.cause.lower() and caught.value.cure
+    assert path.name.replace("\0", "\\x00") in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

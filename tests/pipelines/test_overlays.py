@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -157,10 +158,12 @@ def test_a_mask_file_is_taken_instead_of_what_would_be_found(tmp_path: Path) -> 
     )
 
 
-@pytest.mark.parametrize("kind", ["missing", "size", "black"])
+@pytest.mark.parametrize("kind", ["missing", "size", "black", "pipe"])
 def test_a_mask_file_that_cannot_be_meant_is_refused(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "mask.png"
-    if kind != "missing":
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind != "missing":
         value = 0 if kind == "black" else 255
         cv2.imwrite(str(path), np.full((H, W if kind == "black" else W - 2), value, np.uint8))
     with pytest.raises(ConfigError, match=r"mask\.png"):

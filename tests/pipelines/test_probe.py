@@ -71,6 +71,9 @@ def test_probe_stops_where_it_is_told(clip: Path, capsys: pytest.CaptureFixture[
     assert [(s["last_frame"], s["ended_by"]) for s in shots["list"]] == [(9, "limit")]
     assert cli.main(["probe", str(clip), "--seconds", "0.4"]) == 0
     shown = capsys.readouterr()
+    assert cli.main(["probe", str(clip), "--seconds", "inf", "--json"]) == 0
+    everything = json.loads(capsys.readouterr().out)["shots"]
+    assert (everything["seconds"], everything["complete"]) == (None, True)
     assert "1 in the first 0.4 s" in shown.out and "moved too little" in shown.out and shown.err == ""
 
 
