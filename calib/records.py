@@ -22,10 +22,12 @@ BoolArray = NDArray[np.bool_]
 
 
 def _freeze(record: object, name: str, shape: tuple[int | None, ...], dtype: type = float) -> None:
-    value: NDArray[Any] = np.asarray(getattr(record, name), dtype=dtype)
-    if value.flags.writeable or not value.flags.owndata:
-        # An array that nobody can write to is shared: of a long shot's pairs there are several records each.
-        value = np.array(value, copy=True)
+    given = getattr(record, name)
+    # What nobody can write to is shared: of a long shot's pairs there are several records each.
+    held = isinstance(given, np.ndarray) and given.flags.owndata and not given.flags.writeable
+    value: NDArray[Any] = (
+        given if held and given.dtype == np.dtype(dtype) else np.array(given, dtype=dtype, copy=True)
+    )
     if value.ndim != len(shape) or any(
         s is not None and s != n for s, n in zip(shape, value.shape, strict=True)
     ):

@@ -292,6 +292,19 @@ def test_records_refuse_wrong_shapes_and_stay_as_they_are():
         refine(graph, options=RefineOptions(reference=999))
 
 
+def test_records_share_what_nobody_can_write_to_and_copy_the_rest():
+    _, graph = make(19, n=3, pan_deg=5)
+    e = graph.edges[0]
+    again = replace(e, kappa=2.0)
+    assert again.grid_a is e.grid_a and again.info is e.info
+    mine = e.grid_b.copy()
+    of_mine, view = replace(e, grid_b=mine), np.broadcast_to(mine, mine.shape)
+    of_view = replace(e, grid_b=view)  # read-only, but of an array that is not
+    mine += 1.0
+    np.testing.assert_array_equal(of_mine.grid_b, e.grid_b)
+    np.testing.assert_array_equal(of_view.grid_b, e.grid_b)
+
+
 def long_pan(seed=4, n=60):
     """A fast pan past narrow views, each linked to its next ones only: the valley of focal lengths is long and bent."""
     return make(seed, n=n, pan_deg=110, f_w=2.0, zoom=1.1, max_span=2)
