@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -56,19 +56,11 @@ def _prior_only(solution: Solution, tracker: ShotTracker) -> Solution:
 
 def _with_duplicates(solution: Solution, tracker: ShotTracker) -> Solution:
     """Repeated pictures get the camera of the picture that they repeat."""
-    order = [o.frame for o in tracker.observations]
     row = {int(f): i for i, f in enumerate(solution.frames)}
-    source: list[int] = []
-    kept: list[int] = []
-    last: int | None = None
-    for o in tracker.observations:
-        if o.frame in row:
-            last = row[o.frame]
-        elif o.reason != "duplicate" or last is None:
-            continue
-        kept.append(o.frame)
-        source.append(last if last is not None else row[order[0]])
-    pick = np.array(source)
+    repeats = repeated_from(tracker.observations)
+    shown = {o.frame: repeats.get(o.frame, o.frame) for o in tracker.observations}
+    kept = [frame for frame, first in shown.items() if first in row]
+    pick = np.array([row[shown[frame]] for frame in kept], np.int64)
     return replace(
         solution,
         frames=np.array(kept),
@@ -79,6 +71,19 @@ def _with_duplicates(solution: Solution, tracker: ShotTracker) -> Solution:
         cov_rot=solution.cov_rot[pick],
         rms_px=solution.rms_px[pick],
     )
+
+
+def repeated_from(observations: Iterable[Observation]) -> dict[int, int]:
+    """The picture that each repeated one repeats, by number: the last one before it that was registered itself."""
+    found: dict[int, int] = {}
+    last: int | None = None
+    for o in observations:
+        if o.reason == "duplicate":
+            if last is not None:
+                found[o.frame] = last
+        elif o.status == "ok":
+            last = o.frame
+    return found
 
 
 def frame_steps(tracker: ShotTracker) -> list[PairFit]:

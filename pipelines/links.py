@@ -6,7 +6,7 @@ Each doubtful pair looks plausible alone, and a chain of them drifts by tens of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -82,14 +82,19 @@ def verified_frames(frames: NDArray[np.int64], fits: Iterable[PairFit], referenc
     return np.isin(parts, home)
 
 
-def without_doubtful(solution: Solution, fits: Iterable[PairFit]) -> tuple[Solution, set[int]]:
+def without_doubtful(
+    solution: Solution, fits: Iterable[PairFit], repeats: Mapping[int, int]
+) -> tuple[Solution, set[int]]:
     """The solution with the cameras of unverified frames taken out, and those frames' numbers.
 
-    fits: pairs of keyframes with each other and of frames with keyframes, no frame-to-frame steps. A run of up to
-    BRIDGE_FRAMES unverified frames beside a verified one stays: the steps carry that far.
+    fits: pairs of keyframes with each other and of frames with keyframes, no frame-to-frame steps. repeats: the
+    picture that each repeated one repeats, which has no pairs of its own and is as good as that one, however long it
+    stands. A run of up to BRIDGE_FRAMES unverified frames beside a verified one stays: the steps carry that far.
     """
     frames = np.asarray(solution.frames, np.int64)
     good = verified_frames(frames, fits, solution.reference)
+    verified = set(frames[good].tolist())
+    good |= np.array([repeats.get(int(f)) in verified for f in frames], np.bool_)
     if not good.any():
         return solution, set()
     places = np.flatnonzero(good)

@@ -15,7 +15,7 @@ import numpy as np
 from mosaic.records import PairFit
 from pipelines.archive import to_json, write_arrays
 from pipelines.bridge import CameraPlacement
-from pipelines.camera_track import frame_poses, placements_of
+from pipelines.camera_track import frame_poses, placements_of, repeated_from
 from pipelines.config import Config
 from pipelines.kept_shots import KeptShot, ShotShelf, rest
 from pipelines.links import contradicted_frames, without_doubtful
@@ -80,7 +80,9 @@ def _member(group: Group, kept: KeptShot) -> _Member:
     own = kept.solved.keyframes.solution.reference
     local = own if own in solved else next(k for k in keyframes if k in solved)
     keyed = [f for f in fits if f.src in kept.keyframes]
-    solution, doubtful = without_doubtful(replace(solution, reference=local), [*result.fits, *keyed])
+    solution, doubtful = without_doubtful(
+        replace(solution, reference=local), [*result.fits, *keyed], repeated_from(kept.observations)
+    )
     log_f_ref = float(result.solution.log_f[result.solution.index(result.solution.reference)])
     rows = shot_rows(
         shot=kept.index, facts=kept.facts, solution=solution, verdict=group.verdict, level=group.level, fits=fits,

@@ -19,7 +19,7 @@ from mosaic.composite import Panorama
 from mosaic.framestore import FrameStore
 from mosaic.records import MotionGraph, PairFit
 from pipelines.bridge import CameraPlacement, rolling_of
-from pipelines.camera_track import frame_poses, frame_steps, placements_of
+from pipelines.camera_track import frame_poses, frame_steps, placements_of, repeated_from
 from pipelines.config import Config
 from pipelines.decode import Frame
 from pipelines.film import chosen, filmed
@@ -156,7 +156,9 @@ def _without_panorama(job: _Job, shot: CalibratedShot, why: str) -> CalibratedSh
     """A shot's cameras by the first pass' pairs."""
     tracker = job.tracker
     keyed = [f for f in tracker.fits if f.src in tracker.keyframes]
-    solution, doubtful = without_doubtful(shot.solution, [*shot.keyframes.fits, *keyed])
+    solution, doubtful = without_doubtful(
+        shot.solution, [*shot.keyframes.fits, *keyed], repeated_from(tracker.observations)
+    )
     rows = shot_rows(
         shot=job.shot, facts=job.facts, solution=solution, verdict=shot.verdict, level=shot.level,
         fits=tracker.fits, doubtful=doubtful,
@@ -198,7 +200,9 @@ def _with_panorama(
                     film=film,
                 )  # fmt: skip
                 return _without_cameras(job, again)
-            solution, doubtful = without_doubtful(solution, [*keyframes.fits, *fits])
+            solution, doubtful = without_doubtful(
+                solution, [*keyframes.fits, *fits], repeated_from(tracker.observations)
+            )
         with timings.measure("composite"):
             panorama, players = _composed(job, solution, keyframes, world, plan, store)
         kept = keep_frames and panorama is not None

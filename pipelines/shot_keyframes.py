@@ -65,7 +65,7 @@ def solve_keyframes(
 
     result = refined(templates, tracker.calibrator.solution if tracker.trusts_camera else None)
     alone = part_to_solve_alone(
-        [o.frame for o in tracker.observations if o.status == "ok"],
+        [o.frame for o in tracker.observations if o.status == "ok" and o.reason != "duplicate"],
         templates,
         [*result.fits, *(f for f in tracker.fits if f.src in tracker.keyframes)],
         result.solution.reference,

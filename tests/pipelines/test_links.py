@@ -1,13 +1,17 @@
-"""Frames that contradict their own pairs."""
+"""Frames that contradict their own pairs, and frames that only doubtful pairs lead to."""
 
 from __future__ import annotations
 
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 
 from calib.records import Lens, Priors, Solution
-from pipelines.links import contradicted_frames
+from mosaic.records import PairFit, PairStatus
+from pipelines.camera_track import repeated_from
+from pipelines.links import contradicted_frames, without_doubtful
+from pipelines.tracking import Observation
 
 N = 60
 
@@ -59,3 +63,25 @@ def test_the_reference_and_lost_frames_are_never_named():
         _solution(rms_px=_with(rms, [5], np.nan), log_f=_with(plain.log_f, [5], np.nan))
     )
     assert not found.any()
+
+
+def test_a_picture_that_stands_for_long_is_as_good_as_the_one_it_repeats():
+    stands = range(20, 50)
+    seen = cast(
+        "list[Observation]",
+        [SimpleNamespace(frame=k, status="ok", reason="duplicate" if k in stands else "") for k in range(N)],
+    )
+    repeats = repeated_from(seen)
+    assert repeats == dict.fromkeys(stands, 19)
+
+    def pairs(last: int) -> list[PairFit]:
+        found = [(0, k) for k in range(1, last) if k not in stands]
+        return cast(
+            "list[PairFit]",
+            [SimpleNamespace(src=a, dst=b, status=PairStatus.OK, route="predicted") for a, b in found],
+        )
+
+    assert without_doubtful(_solution(), pairs(N), repeats)[1] == set()
+    # Without its own pairs, or where the picture that it repeats has none, a frame stays doubtful.
+    assert without_doubtful(_solution(), pairs(N), {})[1] == set(range(26, 44))
+    assert without_doubtful(_solution(), pairs(10), repeats)[1] == set(range(16, N))
