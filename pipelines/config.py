@@ -266,7 +266,7 @@ class ShotOptions(Section):
         default=12000,
         ge=250,
         description=(
-            "pictures; a longer shot is divided, each part calibrated by itself: memory grows by 25 KiB per "
+            "pictures; a longer shot is divided, each part calibrated by itself: memory grows by 30 KiB per "
             "picture of a shot"
         ),
     )
