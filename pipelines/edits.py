@@ -244,8 +244,9 @@ class EditFinder:
             inside = _blurred(np.where(a < -500.0, np.float32(-1e6), 0.0).astype(np.float32)) > -1.0
             if inside.sum() < 100:
                 continue
-            c = np.corrcoef(_blurred(np.maximum(a, 0.0))[inside], b[inside])[0, 1]
-            if c > LIKE_BEFORE:
+            now, then = _blurred(np.maximum(a, 0.0))[inside], b[inside]
+            # Black, or another even grey, is like nothing.
+            if min(now.std(), then.std()) > 0 and np.corrcoef(now, then)[0, 1] > LIKE_BEFORE:
                 return True
         return False
 

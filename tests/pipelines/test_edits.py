@@ -81,6 +81,13 @@ def test_a_fade_is_named() -> None:
     assert abs(edits[0].last + 1 - 40) <= 2 and abs(edits[0].first - 60) <= 2
 
 
+def test_black_is_like_nothing_and_warns_of_nothing() -> None:
+    dark = [np.full((H, W), 16, np.uint8)] * 20
+    rising = [(16 + (p - 16.0) * k / 15).astype(np.uint8) for k, p in enumerate(view(1, 15))]
+    found([*dark, *rising, *view(1, 40)])  # warnings are failures
+    found([*view(1, 40), *dark, *view(2, 40)])
+
+
 def test_flashes_cut_nothing() -> None:
     pictures = view(1, 90)
     for k in (30, 31, 60):
