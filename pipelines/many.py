@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.errors import ConfigError, UserError
+from pipelines.output_folder import LOCK
 from pipelines.stills import is_pattern
 
 if TYPE_CHECKING:
@@ -92,9 +93,11 @@ def folder_names(clips: Sequence[Path]) -> list[str]:
     Names that differ by case only count as the same: on many disks they are.
     """
     names: list[str] = []
-    taken = {SUMMARY}
+    taken = {SUMMARY, LOCK}
     for clip in clips:
-        stem = (clip.absolute().parent.name if is_pattern(clip) else clip.stem) or "clip"
+        # '..' is a folder of images too, and no name for one of results.
+        whole = Path(os.path.abspath(clip))
+        stem = (whole.parent.name if is_pattern(clip) else whole.stem) or "clip"
         name, number = stem, 2
         while name.casefold() in taken:
             name, number = f"{stem}-{number}", number + 1

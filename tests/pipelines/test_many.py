@@ -48,9 +48,22 @@ def test_folder_names_are_unique_whatever_the_clips_are_called() -> None:
         "take1/%06d.png",
         "take1/*.png",
         "x.y.mp4",
+        "take2/sub/..",
+        ".lock.mp4",
     ]
     names = folder_names([Path(clip) for clip in clips])
-    assert names == ["a", "A-2", "a-2-2", "a-3", "summary.csv-2", "take1", "take1-2", "x.y"]
+    assert names == [
+        "a",
+        "A-2",
+        "a-2-2",
+        "a-3",
+        "summary.csv-2",
+        "take1",
+        "take1-2",
+        "x.y",
+        "take2",
+        ".lock-2",
+    ]
     assert len({name.casefold() for name in names}) == len(clips)
 
 
