@@ -138,8 +138,10 @@ def _wide_sample(
     level = pyramid.levels[index]
     scale = pyramid.scales[index]
     h, w = level.shape
-    xs = np.linspace(2, w - 3, 32).round()
-    ys = np.linspace(2, h - 3, 18).round()
+    # Two px from the sides; the coarse level of a very small picture has not that many.
+    left, top = min(2, (w - 1) // 2), min(2, (h - 1) // 2)
+    xs = np.linspace(left, w - 1 - left, 32).round()
+    ys = np.linspace(top, h - 1 - top, 18).round()
     grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     full = to_full(grid, scale)
     at = to_level(full, scale).round().astype(int)

@@ -60,7 +60,7 @@ class DecodeOptions(Section):
     )
     image_fps: float = Field(
         default=25.0,
-        gt=0,
+        ge=1e-6,
         le=10000,
         description=("pictures/s given to image sequences, which carry no time; 25 is only a convention"),
     )

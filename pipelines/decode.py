@@ -308,7 +308,10 @@ def _judge_order(flagged: bool, stated: str, seen: str, warnings: list[str]) -> 
 
 def _gop_timecode(video: av.VideoFrame, fps: float) -> Timecode | None:
     """MPEG-2's time code of the group of pictures, where the first frame carries one."""
-    data: Any = video.side_data.get("GOP_TIMECODE")
+    try:
+        data: Any = video.side_data.get("GOP_TIMECODE")
+    except ValueError:  # beside it lies something that PyAV has no name for: EXIF of a photograph
+        return None
     return Timecode.from_mpeg(int.from_bytes(bytes(data)[:8], "little"), fps) if data is not None else None
 
 

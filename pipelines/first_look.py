@@ -19,7 +19,7 @@ from mosaic.estimator import RegisterOptions
 from pipelines.config import Config
 from pipelines.decode import Clip
 from pipelines.overlays import OverlayFinder
-from pipelines.preparation import prepare_frame
+from pipelines.preparation import prepare_frame, refuse_tiny
 from pipelines.progress import Progress, silent
 from pipelines.shots import ShotSplitter, TrackedShot
 from pipelines.tracking import ShotTracker, selection_of
@@ -48,8 +48,9 @@ def look_at(
 ) -> dict[str, Any]:
     """{'shots': ..., 'overlays': ...} of the clip's first seconds (None: all of it), JSON-ready; see probe.probe.
 
-    Raises what decoding raises.
+    Raises what decoding raises, and InputError where the pictures are too small.
     """
+    refuse_tiny(clip.facts.path, clip.facts.size_px)
     w, h = clip.facts.size_px
     shrink = 2 if w >= HALF_FROM_PX else 1
     size_px = ((w + shrink - 1) // shrink, (h + shrink - 1) // shrink)

@@ -6,6 +6,7 @@ It knows nothing of the frames before, so that the next frame is prepared in a t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,11 @@ from numpy.typing import NDArray
 from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.rescue import small_gray
 from mosaic.template import SelectionOptions, Template, build_template
+from pipelines.errors import InputError
 
 SMALL_PX = 1280  # width below which a picture is small
 LARGE_PX = 1600  # and from which it is large
+LEAST_SIDE_PX = 8  # two pixels at a quarter of the size, where graphics are looked for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,6 +37,13 @@ class PreparedFrame:
     def coarse(self) -> NDArray[np.generic]:
         """A quarter of the picture or less: to tell a repeated one."""
         return self.pyramid.levels[min(2, len(self.pyramid.levels) - 1)]
+
+
+def refuse_tiny(path: Path, size_px: tuple[int, int]) -> None:
+    """Raises InputError: pictures too small for a camera to be followed in them."""
+    if min(size_px) < LEAST_SIDE_PX:
+        cause = f"its pictures have {size_px[0]}x{size_px[1]} px"
+        raise InputError(path, cause, f"a camera can be followed from {LEAST_SIDE_PX} px a side on")
 
 
 def finest_of(size_px: tuple[int, int]) -> int:

@@ -34,7 +34,7 @@ from pipelines.keyframe_graph import KeyframeImages
 from pipelines.merged_shots import merge_shots
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.overlays import OverlayFinder, both_masks
-from pipelines.preparation import PreparedFrame, prepare_frame
+from pipelines.preparation import PreparedFrame, prepare_frame, refuse_tiny
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report.build import write_report
 from pipelines.shot import Timings, lost_rows, priors_of, solve_shot
@@ -107,6 +107,7 @@ def process(
         OutputFolder(out, run_digest(config, opened.facts.identity()), resume=resume) as folder,
         tempfile.TemporaryDirectory(prefix=".scratch-", dir=folder.staging) as scratch,
     ):
+        refuse_tiny(opened.facts.path, opened.facts.size_px)
         finished = {record.index: (record, rows) for record, rows in folder.finished_shots()}
         if finished and config.shots.merge:
             # Files of an interrupted run do not hold what merging needs: keyframes, pairs, pictures.

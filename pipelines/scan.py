@@ -66,8 +66,12 @@ def _pulldown(told: list[str]) -> str:
 
 
 def _vote(before: NDArray[np.float32], here: NDArray[np.float32], following: NDArray[np.float32]) -> str:
-    if before.shape != here.shape or here.shape != following.shape:
-        return "unknown"
+    if (
+        before.shape != here.shape
+        or here.shape != following.shape
+        or min(here.shape[0] - 3, here.shape[1]) < 1
+    ):
+        return "unknown"  # a line of each field needs one above and one below it
     around = here[:-2] + here[2:]
 
     def misfit(other: NDArray[np.float32], first_row: int) -> float:

@@ -55,15 +55,18 @@ def second_pass(
 
         return retracker.register(frame.index, pyramid)
 
+    deep: bool | None = None
+
     def keep(frame: Frame) -> Small | None:
         picture = cache(frame.picture)  # a conversion, and both may ask for it
         small = moving.reduce(frame.index, picture)
         if frame.index in planned:
             # Of a small clip the reduced picture is the picture itself, and the store makes its own smaller ones.
             reduced = small.rgb if small is not None and small.rgb.shape != picture().shape else None
-            deep = (
-                frame.gray.dtype != np.uint8
-            )  # the source has more than 8 bits, and the panorama keeps them
+            nonlocal deep
+            if deep is None:
+                # Its source has more than 8 bits, and the panorama keeps them; images of a folder need not be alike.
+                deep = frame.gray.dtype != np.uint8
             store.put(frame.index, frame.deep_picture(True) if deep else picture(), mask, small=reduced)
         return small
 

@@ -57,12 +57,13 @@ def list_images(path: Path) -> list[Path]:
     if not parent.is_dir():
         return []
     names = [p for p in parent.iterdir() if not p.name.startswith(".")]
-    images = [p for p in names if p.suffix.lower() in IMAGE_SUFFIXES]
+    # Files only: opening a pipe of that name would wait for ever.
+    images = [p for p in names if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
     if path.is_dir():
         found = images
     elif _COUNTER.search(path.name):
         exact = "".join(r"\d+" if i % 2 else re.escape(part) for i, part in enumerate(_split(path.name)))
-        found = [p for p in names if re.fullmatch(exact, p.name)]
+        found = [p for p in names if re.fullmatch(exact, p.name) and p.is_file()]
     else:
         found = [p for p in images if fnmatch.fnmatchcase(p.name, path.name)]
 

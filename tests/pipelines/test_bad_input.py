@@ -9,11 +9,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from pipelines import cli
 from tests.pipelines.clips import write_audio, write_clip
 from tests.pipelines.end_to_end import Finished, digests, one_line
+from tests.pipelines.zoo import luma
 
 pytestmark = pytest.mark.slow  # whole runs
 
@@ -63,6 +66,28 @@ def test_unusable_input_is_one_line_and_touches_nothing(
         assert (shown.out == "") is not as_json
     assert digests(pan_run.out) == before
     assert not fresh.exists()
+
+
+@pytest.mark.parametrize("size", [(2, 2), (320, 6)])
+def test_pictures_too_small_for_any_camera_are_refused(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], size: tuple[int, int]
+) -> None:
+    clip = write_clip(tmp_path / "tiny.mkv", size=size, pix_fmt="gray")
+    for args in (["run", str(clip), "-o", str(tmp_path / "out")], ["probe", str(clip)]):
+        assert cli.main(args) == 2
+        assert f"{size[0]}x{size[1]} px" in one_line(capfd.readouterr().err)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("deep_first", [False, True])
+def test_images_of_unlike_depth_are_one_clip(tmp_path: Path, deep_first: bool) -> None:
+    (tmp_path / "in").mkdir()
+    for k in range(14):
+        grey = luma(k).astype(np.uint8)
+        picture = np.dstack([grey] * 3).astype(np.uint16) * 257 if (k % 2 == 0) is deep_first else grey
+        cv2.imwrite(str(tmp_path / "in" / f"{k}.png"), picture)
+    assert cli.main(["run", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "-q"]) == 0
+    assert (tmp_path / "out" / "shot-000" / "panorama.jpg").is_file()
 
 
 def test_a_mistake_leaves_no_traceback_in_a_real_process(tmp_path: Path, pan_run: Finished) -> None:

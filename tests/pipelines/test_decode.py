@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -234,6 +235,23 @@ def test_image_folder_and_pattern_in_order_of_number(tmp_path: Path) -> None:
         assert len(frames) == 11 and clip.facts.size_px == (64, 48)
         np.testing.assert_array_equal(frames[10].gray, ramp(10))  # f10 after f9, not after f1
         assert frames[10].pts_s == pytest.approx(0.2)
+
+
+def test_what_lies_in_a_folder_of_images_and_is_no_file_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "f1.png").touch()
+    (tmp_path / "f2.png").mkdir()
+    os.mkfifo(tmp_path / "f3.png")  # opening it would wait for ever
+    for path in (tmp_path, tmp_path / "f%d.png", tmp_path / "f*.png"):
+        assert [p.name for p in list_images(path)] == ["f1.png"]
+
+
+def test_images_of_sixteen_bits_with_a_photographs_notes_are_read(tmp_path: Path) -> None:
+    # FFmpeg puts a TIFF's EXIF beside the picture, a kind of data that PyAV has no name for.
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.tif"), np.full((48, 64, 3), 257 * (20 + k), np.uint16))
+    clip, frames = decode(tmp_path)
+    assert (clip.facts.bit_depth, clip.facts.timecode) == (16, "")
+    assert [round(float(f.gray.mean())) for f in frames] == [20, 21, 22]
 
 
 def test_digits_that_are_no_decimals_do_not_upset_the_order_of_images(tmp_path: Path) -> None:
