@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from types import TracebackType
@@ -146,6 +146,7 @@ class OutputFolder:
         # Hidden names are scratch of the stages, whole folders of it included.
         kept = [n for n in names if n.name not in STATE and not any(part.startswith(".") for part in n.parts)]
         files = sorted(n.as_posix() for n in kept)
+        self._refuse_blocked(files)
         stale = _files_of_earlier_run(self.out) - set(files) - {"run.json"}
         data = {**run_as_dict(record), "digest": self.digest, "files": sorted({*files, "run.json"})}
         write_json(self.staging / "run.json", data)
@@ -160,6 +161,16 @@ class OutputFolder:
             while folder != self.out and folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
                 folder = folder.parent
+
+    def _refuse_blocked(self, files: Iterable[str]) -> None:
+        """Raises OutputError, before anything is replaced: a user's folder stands where a file goes, or the reverse."""
+        for name in files:
+            target = self.out / name
+            parents = [place for place in target.parents if self.out in place.parents]
+            blocked = next((place for place in parents if place.exists() and not place.is_dir()), None)
+            if blocked is not None or target.is_dir():
+                cause = "is in the way of the results"
+                raise OutputError(blocked or target, cause, "move it, or choose another folder with -o")
 
     def _release(self) -> None:
         if self._lock is not None:

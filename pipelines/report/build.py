@@ -60,7 +60,8 @@ def write_report(
     path = out / "report.html"
     part = out / f".report.html.{os.getpid()}.part"
     try:
-        part.write_text(page, encoding="utf-8")
+        # A file name on disk may be no text at all: what is none is shown as ?.
+        part.write_text(page, encoding="utf-8", errors="replace")
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -79,6 +79,33 @@ def test_pictures_too_small_for_any_camera_are_refused(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("name", ["camera.csv", "shot-000"])
+def test_what_is_in_the_way_of_results_is_named_before_anything_changes(
+    pan_clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    if name == "camera.csv":
+        (out / name).mkdir()  # a folder where a file goes
+    else:
+        (out / name).write_text("mine")  # a file where a folder goes
+    few = ["--run.max_frames", "12", "--panorama.enabled", "false", "-q"]
+    assert cli.main(["run", str(pan_clip), "-o", str(out), *few]) == 2
+    assert "in the way" in one_line(capfd.readouterr().err)
+    assert {path.name for path in out.iterdir() if not path.name.startswith(".partial-")} == {name}
+
+
+def test_a_name_that_is_no_text_does_not_lose_the_run(pan_clip: Path, tmp_path: Path) -> None:
+    clip = tmp_path / os.fsdecode(b"n\xff.mp4")
+    try:
+        shutil.copy(pan_clip, clip)
+    except OSError:
+        pytest.skip("this file system takes only text for names")
+    few = ["--run.max_frames", "12", "--panorama.enabled", "false", "-q"]
+    assert cli.main(["run", str(clip), "-o", str(tmp_path / "out"), *few]) == 0
+    assert "n?.mp4" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("deep_first", [False, True])
 def test_images_of_unlike_depth_are_one_clip(tmp_path: Path, deep_first: bool) -> None:
     (tmp_path / "in").mkdir()
