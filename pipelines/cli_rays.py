@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +26,9 @@ FORWARD, BACK = ("x_px", "y_px"), ("pan_deg", "tilt_deg")
 def rays(
     context: typer.Context,
     out: Out,
-    frame: Annotated[int | None, typer.Option(min=0, help="Frame number, as in camera.csv.")] = None,
+    frame: Annotated[
+        int | None, typer.Option(min=0, max=10**12, help="Frame number, as in camera.csv.")
+    ] = None,
     pixel: Annotated[
         list[str] | None, typer.Option(help="X,Y in px, (0, 0) the top-left pixel's centre; may come again.")
     ] = None,
@@ -135,6 +138,8 @@ def read_points(path: Path) -> tuple[tuple[str, ...], list[int], list[tuple[floa
 def _pair(text: str, option: str) -> tuple[float, float]:
     try:
         a, b = (float(part) for part in text.split(","))
+        if not (math.isfinite(a) and math.isfinite(b)):
+            raise ValueError
     except ValueError:
         raise typer.BadParameter(f"{option} takes two numbers with a comma between, not {text!r}") from None
     return a, b

@@ -223,6 +223,8 @@ def test_commands_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFi
         "give --points FILE, or --frame": ["rays", out],
         "needs --pixel": ["rays", out, "--frame", "40"],
         "two numbers with a comma": ["rays", out, "--frame", "40", "--pixel", "5"],
+        "not 'nan,1'": ["rays", out, "--frame", "40", "--pixel", "nan,1"],
+        "--frame": ["rays", out, "--frame", "9" * 25, "--pixel", "5,5"],
         "the run has frames 40 to 52": ["rays", out, "--frame", "7", "--pixel", "5,5"],
         "lacks columns": ["rays", out, "--points", str(tmp_path / "bad.csv")],
         "no number": ["rays", out, "--points", str(tmp_path / "word.csv")],
