@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from calib import camera, rotation
 from calib.dlt import square_root_information
@@ -161,8 +162,7 @@ class State:
         in the mean log f leaves it by d^2 / 2 of the angles; turned by (1 - exp(-d)) / d as far, it stays in. Small
         steps are the same.
         """
-        mean = frames[..., 0].mean(-1)[:, None, None]
-        bent = np.where(np.abs(mean) > 1e-9, -np.expm1(-mean) / np.where(mean == 0, 1.0, mean), 1.0)
+        bent = special.exprel(-frames[..., 0].mean(-1))[:, None, None]
         R = rotation.orthonormalise(rotation.exp(frames[..., 1:] * bent) @ self.R)
         return State(self.log_f + frames[..., 0], R, self.shared + shared)
 
