@@ -27,6 +27,7 @@ from mosaic.records import PAIR_REASONS, FloatArray, PairFit, PairStatus
 from mosaic.rescue import match_features, phase_correlation, small_gray, weak_feature_starts
 from mosaic.rivals import shift_starts
 from mosaic.template import PreparedTemplate, SelectionOptions, build_template, prepare
+from mosaic.turning import held
 from mosaic.warp import HomographyFamily
 
 REASONS = {
@@ -60,6 +61,8 @@ class PairOptions:
     soft already. symmetric_px: how far from where it began the way from a to b and back may end, rms over the measured
     cells, px of a, before the pair is weak; None: not checked. The score alone passes pairs in which most of the strong
     gradients belong to things that move by themselves.
+    turning: hold what the pixels leave open by what a camera does that turns and zooms about the middle of its picture
+    (turning.py): a pull, not a wall; off to leave all eight parameters to the pixels.
     cell_px, max_away: a pair is weak where more than that share of the cells was found farther than cell_px from where
     the homography puts them; max_std_px: or where the anchors' stated error is larger. sure_score, sure_away,
     sure_std_px: when no other start is tried; else the best of all starts is taken, by status and score (measured on
@@ -79,6 +82,7 @@ class PairOptions:
     smooth: bool = True
     symmetric_px: float | None = 1.0
     match_blur: bool = True
+    turning: bool = True
     cell_px: float = 0.5
     max_away: float = 0.3
     max_std_px: float = 0.4
@@ -139,7 +143,16 @@ def register_pyramids(
     # A coarse level too poor to align on is passed over; on the finest level the estimator itself says no_texture.
     levels = [i for i in range(len(template.levels) - 1, 0, -1) if _n_pixels(prepared, i) >= enough] + [0]
     best = _best_of_starts(source, target, prepared, levels, start, options)
-    if not best.usable or not options.match_blur:
+    if options.match_blur:
+        best = _equally_sharp(source, target, best, levels, options)
+    return _held(best, source, target, options) if options.turning else best
+
+
+def _equally_sharp(
+    source: Pyramid, target: Pyramid, best: PairFit, levels: list[int], options: PairOptions
+) -> PairFit:
+    """The fit, or the better one of the pictures made equally sharp."""
+    if not best.usable:
         return best
     difference = spread_difference(source, target, best.H_dst_src, best.gain, best.offset)
     equal = None if difference is None else matched(source, target, difference, best.H_dst_src)
@@ -152,6 +165,14 @@ def register_pyramids(
     )  # fmt: skip
     again = replace(_judged(again, options), n_steps=best.n_steps + again.n_steps)
     return again if _order(again) < _order(best) else best
+
+
+def _held(fit: PairFit, source: Pyramid, target: Pyramid, options: PairOptions) -> PairFit:
+    """The fit with what turning cameras do; no longer `uncertain` where that was all that spoke against it."""
+    fit = held(fit, source.size_px, target.size_px)
+    if fit.reason != "uncertain":
+        return fit
+    return _judged(replace(fit, status=PairStatus.OK, reason=""), options)
 
 
 def _best_of_starts(
