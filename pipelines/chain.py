@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.coords import normalise_homography, transfer
-from mosaic.records import FlowGrid, PairFit
+from mosaic.records import FlowGrid, PairFit, PairStatus
 
 FloatArray = NDArray[np.float64]
 
@@ -64,8 +64,9 @@ def compose_fits(first: PairFit, second: PairFit) -> PairFit:
         src=first.src,
         dst=second.dst,
         H_dst_src=H,
-        status=first.status,
-        reason=first.reason,
+        # No surer than the less sure of the two.
+        status=second.status if first.status == PairStatus.OK else first.status,
+        reason=second.reason if first.status == PairStatus.OK else first.reason,
         overlap=min(first.overlap, second.overlap),
         rms_grey=second.rms_grey,
         score=max(first.score, second.score),

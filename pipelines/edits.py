@@ -76,7 +76,7 @@ class _Seen:
     frame: int
     low: FloatImage
     band: FloatImage
-    to_now: NDArray[np.float64]  # motion since the first frame kept, small px
+    to_now: NDArray[np.float64]  # motion since some frame before or among those kept, small px
     own: float = float("nan")  # share of blocks kept over LAG frames up to this one
 
 
@@ -118,6 +118,12 @@ class EditFinder:
         """The present view begins with this frame: what came before is finished."""
         self._start = frame
         self._begun = None
+        # Motion is counted from here on: over the clip it would grow, and lose its digits, without end.
+        if self._seen:
+            base = next((s for s in self._seen if s.frame >= frame), self._seen[-1])
+            away = np.linalg.inv(base.to_now)
+            for seen in self._seen:
+                seen.to_now = seen.to_now @ away
 
     def _look_for_cut(self, i: int) -> EditFound | None:
         """A cut to a view that does not hold together (a player who fills the frame): only if all changes at once."""
@@ -140,7 +146,7 @@ class EditFinder:
             j = i - span
             if j < 0 or self._seen[j].frame < self._start:
                 break
-            if span >= SLOW_SPAN and self._seen[i].frame % SLOW_EVERY:
+            if span >= SLOW_SPAN and (self._seen[i].frame - self._start) % SLOW_EVERY:
                 continue
             if span < QUICK_SPAN and quick > NOTHING_LEFT:
                 continue
