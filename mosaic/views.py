@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mosaic.surface import Placement, Surface
 
 COVER_CELLS = 600  # over the longer side of the surface: how finely coverage is looked at
+SEAM_CELLS = 4  # of these at once, of frames that lie across a seam
 STRIP_VIEWS = (2, 7)  # least and most of a strip: two that disagree say so at least, a median of 7 is robust
 LEAST_RATIO = 0.08  # of the resolution floor: a view coarser than this does not even vote
 
@@ -101,10 +102,12 @@ class ViewPlan:
 
 
 def lattice_of(surface: Surface, n_points: int = 1200) -> Lattice:
-    """About n_points points over the surface, its four corners among them, not closer than 24 px."""
+    """About n_points points over the surface, its four corners and its middle lines among them, not closer than 24 px
+    where there is room."""
     spacing = max(24.0, float(np.sqrt(surface.width * surface.height / n_points)))
+    # Three at least: the sides of a panorama 20 px high lie in the border that no frame is believed in.
     axes = [
-        np.linspace(0, n - 1, max(2, int(np.ceil((n - 1) / spacing)) + 1))
+        np.linspace(0, n - 1, max(min(n, 3), 2, int(np.ceil((n - 1) / spacing)) + 1))
         for n in (surface.width, surface.height)
     ]
     xy = np.stack(np.meshgrid(axes[0], axes[1]), axis=-1).reshape(-1, 2)
@@ -123,6 +126,8 @@ def centrality(xy: NDArray[np.float64], size_px: tuple[int, int], margin_px: flo
     of the pan axis all grow there: the views that agree best about a point are those that look at it.
     """
     half = (np.array(size_px, dtype=np.float64) - 1) / 2
+    if half.min() <= margin_px:
+        return np.zeros(xy.shape[:-1], np.float32)
     off = np.abs(xy - half) / (half - margin_px)
     with np.errstate(invalid="ignore"):
         inside = (off <= 1).all(axis=-1)
@@ -374,8 +379,8 @@ def plan_views(
 ) -> ViewPlan:
     """Which frames a second pass over the clip has to keep. Cost and result are bounded by the panorama's area.
 
-    placements: approximate ones will do, composite() looks again at the final ones. Raises ValueError when none
-    sees the surface.
+    placements: approximate ones will do, composite() looks again at the final ones. No frames: none sees a point of the
+    surface within its margin (a panorama a few pixels high). Raises ValueError when there is no placement.
     """
     options = options or CompositeOptions()
     candidates = _thin([p for p in placements if np.isfinite(p.px_per_rad)], options.max_candidates)
@@ -384,9 +389,8 @@ def plan_views(
     lattice = lattice_of(surface)
     rating = rate_views(candidates, lattice, options)
     chosen, count, limit = select_views(rating, candidates, options, min_gap=options.min_gap)
-    if not chosen:
-        raise ValueError(f"none of {len(candidates)} placements sees the panorama {surface}")
-    chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
+    if chosen:
+        chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
     return ViewPlan(
         frames=tuple(sorted(candidates[i].frame for i in chosen)),
         n_views=count.reshape(len(lattice.y_px), len(lattice.x_px)),
@@ -435,8 +439,18 @@ def _draw_outline(cells: NDArray[np.uint8], placement: Placement, surface: Surfa
         [np.stack(p, axis=-1) for p in ((u, zero), (one, u), (1 - u, one), (zero, 1 - u))]
     )
     at = surface.ray_to_pixel(placement.pixel_to_ray(border * [width - 1.0, height - 1.0])) / step
-    if np.isfinite(at).all():
+    if not np.isfinite(at).all():
+        return
+    sides = np.linalg.norm(at - np.roll(at, 1, axis=0), axis=1)
+    if sides.max() < max(cells.shape) / 2:
         cv2.fillPoly(cells, [np.rint(at - 0.5).astype(np.int32)], 1)
+        return
+    # Across the seam of a full turn, or where Pannini's surface runs to infinity: the outline encloses nothing there.
+    rows, columns = (np.arange(0, n, SEAM_CELLS) for n in cells.shape)
+    xy = np.stack(np.meshgrid(columns, rows), axis=-1) + SEAM_CELLS / 2
+    seen = _inside_px(placement.ray_to_pixel(surface.pixel_to_ray(xy * step)), placement.size_px) >= 0
+    whole = seen.astype(np.uint8).repeat(SEAM_CELLS, axis=0).repeat(SEAM_CELLS, axis=1)
+    np.maximum(cells, whole[: cells.shape[0], : cells.shape[1]], out=cells)
 
 
 def frame_limit(quality: NDArray[np.float32], options: CompositeOptions) -> int:

@@ -30,7 +30,9 @@ class PanoramaPlan:
 def plan_panorama(
     placements: Sequence[CameraPlacement], config: Config, *, stored: FrameStore | None = None
 ) -> PanoramaPlan:
-    """Surface and frames for these placements. stored: plan among the frames that it holds; None: among all."""
+    """Surface and frames for these placements. stored: plan among the frames that it holds; None: among all.
+
+    views.frames is empty where the panorama would be too small for any frame to be believed in it."""
     options = CompositeOptions(views=config.panorama.views)
     stride = max(1, len(placements) // MAX_PLACEMENTS_FOR_SURFACE)
     surface = choose_surface(

@@ -183,6 +183,10 @@ def _with_panorama(
     with timings.measure("plan"):
         placements = placements_of(first.solution, world, tracker.observations, tracker.size_px, keyframes)
         plan = plan_panorama([p for p in placements if p.frame in piece], job.config)
+    if not plan.views.frames:
+        size = f"{plan.surface.width} x {plan.surface.height}"
+        full = frame_poses(tracker, keyframes, tracker.fits, start=first.solution)
+        return _without_panorama(job, replace(first, solution=full), f"too small, {size} px")
     store = FrameStore(job.scratch, tracker.size_px)
     kept = False
     film: dict[int, bytes] = {}
