@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.cli_results import AsJson, Out, Quiet, print_json, refuse_settings
-from pipelines.errors import EXIT_OK
+from pipelines.errors import EXIT_OK, OutputError
 
 if TYPE_CHECKING:
     from pipelines.progress import Progress
@@ -129,6 +129,9 @@ def render(
     crf: Annotated[
         float, typer.Option(min=0, max=51, help="Quality of H.264 and HEVC; lower is better and larger.")
     ] = 18.0,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a file that is there already (never the clip).")
+    ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> int:
@@ -141,6 +144,9 @@ def render(
 
     run = open_run(out)
     target = path or out / f"{what.value}{'.mov' if codec is CodecName.prores else '.mp4'}"
+    # In OUT the name says what it is, and a new one takes its place as it does with `run` and `export`.
+    if path is not None and path.exists() and not overwrite:
+        raise OutputError(path, "is there already", "give another name, or --overwrite")
     encode = EncodeOptions(codec=codec.value, crf=crf)
     with TerminalProgress(show=not quiet) as progress:
         if what is What.stabilised:

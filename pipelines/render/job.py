@@ -16,7 +16,7 @@ from pipelines.decode import Clip, Frame
 from pipelines.errors import InputError
 from pipelines.progress import Progress
 from pipelines.render.encode import DEEP, EncodeOptions, VideoWriter, clock_of, shown_colour, video_writer
-from pipelines.render.opened import OpenedRun
+from pipelines.render.opened import OpenedRun, refuse_clip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,6 +127,7 @@ def writer_like(
 
     mixed: as for `pictures`; the tags say what its colours are.
     """
+    refuse_clip(path, clip.facts.path)
     own = encode is not None and encode.deep and not mixed
     return video_writer(
         path,

@@ -14,7 +14,7 @@ from pipelines.errors import InputError
 from pipelines.progress import Progress, silent
 from pipelines.render.encode import EncodeOptions, clock_of, shown_colour, video_writer
 from pipelines.render.job import Rendered
-from pipelines.render.opened import OpenedRun, one_shot
+from pipelines.render.opened import OpenedRun, one_shot, refuse_clip
 from pipelines.render.paths import read_move
 from pipelines.render.plate import read_plate
 from pipelines.render.views import View, camera_view
@@ -45,6 +45,7 @@ def move(
 
     The clip itself is not needed.
     """
+    refuse_clip(path, Path(str(run.record.clip.get("path") or "")))
     keys = read_move(Path(options.path))
     if not 0 < keys.duration_s <= MAX_SECONDS:
         cause = f"runs for {keys.duration_s:g} s, more than {MAX_SECONDS:g}"

@@ -11,7 +11,7 @@ import numpy as np
 from pipelines.archive import read_camera_csv, read_run
 from pipelines.config import DecodeOptions
 from pipelines.decode import Clip, open_clip
-from pipelines.errors import InputError, UserError
+from pipelines.errors import InputError, OutputError, UserError
 from pipelines.frame_geometry import FrameGeometry, frame_geometry
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.render.views import View, frame_view, homography_view
@@ -126,6 +126,12 @@ def open_its_clip(run: OpenedRun, elsewhere: Path | None = None) -> Clip:
         cure = "give the very file that was run with --clip FILE, or run again on this one"
         raise InputError(path, "is not the clip that the run was made from", cure)
     return clip
+
+
+def refuse_clip(target: Path, clip: Path) -> None:
+    """Raises OutputError: the video would be written over the clip that it is made from."""
+    if target.exists() and clip.exists() and target.samefile(clip):
+        raise OutputError(target, "is the run's clip", "give another name with -o")
 
 
 def one_shot(run: OpenedRun, candidates: Sequence[int], shot: int | None, why: str) -> int:

@@ -414,6 +414,26 @@ def test_what_is_missing_is_said_in_one_line(
     assert not list(tmp_path.glob("*.mp4")) and not (pan_run.out / "stabilised.mp4").exists()
 
 
+@pytest.mark.parametrize("what", ["stabilised", "move"])
+def test_a_video_replaces_a_file_only_when_told_and_the_clip_never(
+    pan_run: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str
+) -> None:
+    (tmp_path / "keys.csv").write_text("time_s,pan_deg,tilt_deg,hfov_deg\n0,0,0,30\n.2,0,0,30\n")
+    words = ["render", str(pan_run.out), "--what", what, "--keys", str(tmp_path / "keys.csv"), "-o"]
+    mine = tmp_path / "mine.mp4"
+    mine.write_text("something of mine")
+    assert cli.main([*words, str(mine)]) == 2
+    assert "mine.mp4: is there already" in one_line(capsys.readouterr().err)
+    assert mine.read_text() == "something of mine"
+    before = pan_run.clip.read_bytes()
+    assert cli.main([*words, str(pan_run.clip), "--overwrite"]) == 2
+    assert "is the run's clip" in one_line(capsys.readouterr().err)
+    assert pan_run.clip.read_bytes() == before
+    assert cli.main([*words, str(mine), "--overwrite", "-q"]) == 0
+    with av.open(str(mine)) as container:
+        assert container.streams.video
+
+
 def test_a_clip_that_moved_is_found_where_it_is(pan_run: Finished, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(pan_run.out, out)
