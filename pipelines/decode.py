@@ -148,7 +148,7 @@ class Clip:
         self.options = options
         self.counts: dict[str, int] = {}
         self._readers: weakref.WeakSet[_Reader] = weakref.WeakSet()
-        self._told: set[str] = set()
+        self._told = set(facts.warnings)
 
     def __enter__(self) -> Clip:
         return self

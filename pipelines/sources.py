@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -33,6 +34,7 @@ CUT_SHORT_S = (
     0.3  # of the duration that the header promises, where there is sound: it often runs on for a frame or two
 )
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf"})
+STILL_CODECS = frozenset({"mjpeg", "png", "bmp", "gif", "webp", "tiff", "jpeg2000"})
 
 
 class Source(Protocol):
@@ -87,6 +89,7 @@ class ContainerSource:
         self.warnings: list[str] = []
         self._n_other_size = 0
         self._n_concealed = self._n_corrupt = 0
+        self._n_discarded = 0  # packets that an edit list leaves out: decoded for those after them, never shown
         self._first_s = self._last_s = math.nan
         self._container = _open(path)
         try:
@@ -111,9 +114,10 @@ class ContainerSource:
         stated = int(getattr(stream.codec_context, "field_order", 0) or 0)
         self.says_interlaced = stated >= 2
         self.field_order = {2: "tff", 3: "bff", 4: "bff", 5: "tff"}.get(stated, "")
-        others = [s for s in self._container.streams.video if s is not stream and s.codec_context is not None]
-        if others:
-            self.warnings.append(f"{1 + len(others)} video streams; only stream {stream.index} is used")
+        n_streams = sum(s.codec_context is not None for s in _video_streams(self._container))
+        if n_streams > 1:
+            which = f"stream {stream.index} ({stream.width}x{stream.height})"
+            self.warnings.append(f"{n_streams} video streams; only {which} is used")
 
     def __enter__(self) -> Self:
         return self
@@ -152,6 +156,7 @@ class ContainerSource:
             if packet is None:
                 return
             self._n_corrupt += bool(packet.is_corrupt)
+            self._n_discarded += bool(packet.is_discard)
             try:
                 frames = packet.decode()
             except av.error.FFmpegError:
@@ -169,8 +174,9 @@ class ContainerSource:
     def late_warnings(self, n_decoded: int) -> list[str]:
         """What is known only after the last picture."""
         found = list(self.warnings)
-        if self.n_frames_header is not None and self.n_frames_header != n_decoded:
-            found.append(f"the header promises {self.n_frames_header} frames, {n_decoded} could be decoded")
+        promised = None if self.n_frames_header is None else self.n_frames_header - self._n_discarded
+        if promised is not None and promised != n_decoded:
+            found.append(f"the header promises {promised} frames, {n_decoded} could be decoded")
         # By time stamps where there are any: at a variable rate counting tells nothing.
         seen_s = self._last_s - self._first_s + 1 / self.fps
         if not math.isfinite(seen_s):
@@ -178,6 +184,12 @@ class ContainerSource:
         missing_s = self.duration_s - seen_s
         alone = len(self._container.streams) == 1
         allowed_s = 0.6 / self.fps if alone else max(CUT_SHORT_S, 0.02 * self.duration_s)
+        stream = self._stream
+        start_s = math.nan if stream.start_time is None else float(stream.start_time * stream.time_base)
+        head_s = self._first_s - start_s
+        if self.n_frames_header is None and head_s > 0.6 / self.fps:
+            found.append(f"the first {head_s:.2f} s are damaged, or lack the picture that they build on")
+            missing_s -= head_s
         if self.n_frames_header is None and missing_s > allowed_s:
             found.append(
                 f"truncated: the header promises {self.duration_s:.2f} s, the last {missing_s:.2f} s are missing"
@@ -307,13 +319,28 @@ def _open(path: Path) -> Any:
     return container
 
 
+def _video_streams(container: Any) -> list[Any]:
+    """Streams of moving pictures, the likeliest first: a codec of stills beside another is a cover or a thumbnail, and
+    of several the largest is the programme."""
+    streams = [
+        s for s in container.streams.video if "attached_pic" not in str(getattr(s, "disposition", "")).lower()
+    ]
+
+    def rank(stream: Any) -> tuple[bool, bool, int]:
+        context = stream.codec_context
+        if context is None:
+            return True, True, 0
+        return False, context.codec.canonical_name in STILL_CODECS, -stream.width * stream.height
+
+    return sorted(streams, key=rank)
+
+
 def _video_stream(container: Any, path: Path) -> Any:
-    for stream in container.streams.video:
-        cover = "attached_pic" in str(getattr(stream, "disposition", "")).lower()
-        if not cover:
-            if stream.codec_context is None:
-                raise InputError(path, "its video codec is not in this FFmpeg", "convert it to H.264 first")
-            return stream
+    streams = _video_streams(container)
+    if streams and streams[0].codec_context is None:
+        raise InputError(path, "its video codec is not in this FFmpeg", "convert it to H.264 first")
+    if streams:
+        return streams[0]
     kinds = sorted({s.type for s in container.streams if s.type}) or ["nothing"]
     raise InputError(
         path, f"has no video stream (only {', '.join(kinds)})", "give a file with moving pictures"
@@ -378,4 +405,8 @@ def _rate(stream: Any) -> float:
 def _duration(container: Any, stream: Any) -> float:
     if stream.duration is not None and stream.time_base:
         return float(stream.duration * stream.time_base)
+    # Matroska's own length is that of its longest stream; of each one writers say it in a tag, hh:mm:ss.
+    match = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", str(stream.metadata.get("DURATION", "")))
+    if match is not None:
+        return 3600.0 * int(match[1]) + 60.0 * int(match[2]) + float(match[3])
     return container.duration / av.time_base if container.duration is not None else math.nan

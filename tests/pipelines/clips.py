@@ -53,7 +53,7 @@ def write_clip(
             stream.set_display_rotation(rotation)
         for i in range(n):
             picture = pictures[i] if pictures is not None else ramp(i, size)
-            frame = _video(picture, pix_fmt)
+            frame = video_frame(picture, pix_fmt)
             for key, value in (colour or {}).items():
                 setattr(frame, key, value)
             frame.pts = pts[i] if pts is not None else i
@@ -63,7 +63,8 @@ def write_clip(
     return path
 
 
-def _video(picture: NDArray[Any], pix_fmt: str) -> av.VideoFrame:
+def video_frame(picture: NDArray[Any], pix_fmt: str) -> av.VideoFrame:
+    """RGB (h, w, 3), or luma (h, w) as it shall be stored."""
     if picture.ndim == 3:
         return av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format=pix_fmt)
     h, w = picture.shape
