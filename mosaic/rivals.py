@@ -191,22 +191,56 @@ def _placed(
 
 def _usable(target: Pyramid, index: int) -> NDArray[np.float32]:
     """The level (h, w), NaN where it is masked."""
-    picture = np.asarray(target.levels[index], np.float32)
+    level = target.levels[index]
     if target.mask is None:
-        return np.ascontiguousarray(picture)
-    picture = picture.copy()
-    h, w = picture.shape
-    mh, mw = target.mask.shape
-    rows, columns = (np.arange(h) * mh // h), (np.arange(w) * mw // w)
-    picture[target.mask[np.ix_(rows, columns)] == 0] = np.nan
-    return picture
+        return np.ascontiguousarray(level, np.float32)
+    return _unmasked(level, target.mask)
 
 
 def _finest(picture: Any, x: Any, y: Any, values: Any, dx: int, dy: int) -> tuple[float, int, int]:
     """(cost, dx, dy) of the best whole shift next to one of the sweep."""
-    costs = _sweep(picture, x + dx, y + dy, values, 1, 1, 1, TRUNCATED_GREY, LEAST_SEEN)
+    costs = _next_to(picture, x + dx, y + dy, values, TRUNCATED_GREY, LEAST_SEEN)
     j, i = np.unravel_index(int(np.argmin(costs)), costs.shape)
     return float(costs[j, i]), dx + int(i) - 1, dy + int(j) - 1
+
+
+@nb.njit(cache=True, nogil=True)
+def _unmasked(level, mask):  # type: ignore[no-untyped-def]
+    """A level (h, w) as float32, NaN where the nearest pixel of a mask of another size is 0."""
+    h, w = level.shape
+    mh, mw = mask.shape
+    out = np.empty((h, w), np.float32)
+    for y in range(h):
+        for x in range(w):
+            usable = mask[y * mh // h, x * mw // w] != 0
+            out[y, x] = np.float32(level[y, x]) if usable else np.float32(np.nan)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _next_to(picture, x, y, values, most, least_seen):  # type: ignore[no-untyped-def]
+    """`_sweep` over the shifts of a pixel and none (3, 3): without its planes, which are for many shifts."""
+    h, w = picture.shape
+    n = len(x)
+    total = np.zeros((3, 3), np.float32)
+    seen = np.zeros((3, 3), np.float32)
+    top = np.float32(most)
+    for k in range(n):
+        for j in range(3):
+            for i in range(3):
+                a, b = x[k] + i - 1, y[k] + j - 1
+                if a < 0 or b < 0 or a >= w or b >= h:
+                    continue
+                away = abs(picture[b, a] - np.float32(values[k]))
+                if away < np.float32(1e9):  # not for NaN
+                    total[j, i] += min(away, top)
+                    seen[j, i] += np.float32(1)
+    out = np.full((3, 3), np.inf)
+    for j in range(3):
+        for i in range(3):
+            if seen[j, i] >= least_seen * n and seen[j, i] > 0:
+                out[j, i] = total[j, i] / seen[j, i]
+    return out
 
 
 @nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})

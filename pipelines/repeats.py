@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Any, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +23,7 @@ class Repeats:
 
     def is_repeat(self, before: NDArray[np.generic], picture: NDArray[np.generic]) -> bool:
         """Of two coarse gray pictures (h, w), 0..255; to be asked once for each picture, in order."""
-        change = float(np.abs(picture.astype(np.float32) - before.astype(np.float32)).mean())
+        change = float(cv2.norm(cast(Any, picture), cast(Any, before), cv2.NORM_L1)) / picture.size
         usual = float(np.median(self._changes)) if len(self._changes) >= 3 else float("nan")
         if change < SAME_GREY or (change < NEARLY_SHARE * usual and change < NEARLY_GREY):
             return True
