@@ -11,7 +11,7 @@ import hashlib
 import queue
 import threading
 import weakref
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -28,13 +28,14 @@ from pipelines.errors import InputError
 from pipelines.hdr import TRANSFERS, WIDE_PRIMARIES, needs_mapping
 from pipelines.picture import Picture
 from pipelines.pixels import deep_rgb_picture, gray_plane, quarter_turns, rgb_picture, yuv_matrix
-from pipelines.scan import LOOK, STEP, judge_scan
+from pipelines.scan import LOOK, STEP, judge_opening, judge_scan, shows_fields
 from pipelines.sources import Source, open_source
 from pipelines.stdin import shown_path
 from pipelines.stills import IMAGE_SUFFIXES, list_images
 from pipelines.timing import PtsRepair, Timecode
 
 TELECINE = "telecine_"  # of scan.judge_scan: film in 60i
+LATER = (0.2, 0.4, 0.6, 0.8)  # of a clip whose first ten seconds show no fields: where they are looked for
 UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
 
 
@@ -196,14 +197,35 @@ def open_clip(path: str | Path, options: DecodeOptions | None = None) -> Clip:
     options = options or DecodeOptions()
     path = Path(path)
     with open_source(path, options) as source:
-        first = next(source.pictures(), None)
+        pictures = source.pictures()
+        first = next(pictures, None)
         if first is None:
             raise InputError(
                 path, "no picture could be decoded", "it is damaged, or its codec is not in this FFmpeg"
             )
-        look = (first, *islice(source.pictures(), LOOK - 1)) if options.deinterlace != "off" else (first,)
-        seen = judge_scan(gray_plane(picture.video, 0)[:, ::STEP].astype(np.float32) for picture in look)
+        seen = _scan_of(source, first, pictures) if options.deinterlace != "off" else "unknown"
         return Clip(_facts(source, first, options, seen), options)
+
+
+def _scan_of(source: Source, first: Picture, pictures: Iterator[Picture]) -> str:
+    """What scan.py says of the clip's first second; of later ones where that shows no fields but there may be some.
+
+    Interlaced formats have 25 or 30 frames a second. Most progressive clips say so and show it within the first."""
+    videos = (picture.video for picture in (first, *islice(pictures, LOOK - 1)))
+    seen = judge_scan(_lumas(videos))
+    plain = seen == "progressive" and source.says_progressive and not first.video.interlaced_frame
+    if shows_fields(seen) or plain or not 23 < source.fps < 31:
+        return seen
+    later = judge_opening(_lumas(picture.video for picture in pictures))
+    for share in LATER:
+        if shows_fields(later):
+            return later
+        later = judge_scan(_lumas(source.pictures_from(share)))
+    return later if shows_fields(later) else seen
+
+
+def _lumas(videos: Iterable[av.VideoFrame]) -> Iterator[NDArray[np.float32]]:
+    return (gray_plane(video, 0)[:, ::STEP].astype(np.float32) for video in videos)
 
 
 def _facts(source: Source, first: Picture, options: DecodeOptions, seen: str) -> ClipFacts:

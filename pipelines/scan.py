@@ -3,12 +3,13 @@
 A line of one field is compared with the two lines of the other field around it (FFmpeg's idet does so): fields that are
 neighbours in time fit better than fields three apart. A scene at rest tells nothing, and then nothing is claimed.
 Film in 60i (3:2 pull-down) shows as one or two interlaced frames in every five, always at the same places.
+A clip may open with a title that is progressive or at rest: then it is looked at further on.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import islice
 
 import numpy as np
@@ -24,6 +25,7 @@ COMB_RATIO = (
 )
 MIN_MISFIT = 1.0  # grey levels between neighbour pictures, below it the scene rests
 MIN_VOTES = 4
+LOOKS = 10  # at consecutive seconds, before other places of the clip are tried
 CYCLE = 5  # frames of a pull-down cycle
 PULLDOWNS = ((0, 1), (0,))  # interlaced frames of a cycle, from the first: 2:3, and 2:3:3:2 ("advanced")
 
@@ -49,6 +51,16 @@ def judge_scan(lumas: Iterable[NDArray[np.float32]]) -> str:
         return "unknown"
     winner, n = votes.most_common(1)[0]
     return winner if n >= MIN_VOTES and n >= 0.8 * votes.total() else "unknown"
+
+
+def judge_opening(lumas: Iterator[NDArray[np.float32]]) -> str:
+    """judge_scan of the first of LOOKS consecutive looks that shows fields, else 'unknown'."""
+    return next((seen for _ in range(LOOKS) if shows_fields(seen := judge_scan(lumas))), "unknown")
+
+
+def shows_fields(seen: str) -> bool:
+    """Whether a judgement is of interlaced frames, with or without pull-down."""
+    return seen not in ("unknown", "progressive")
 
 
 def _pulldown(told: list[str]) -> str:

@@ -50,6 +50,7 @@ class Source(Protocol):
     pixel_aspect: float | None
     timecode: Timecode | None
     says_interlaced: bool
+    says_progressive: bool
     field_order: str
     warnings: list[str]
     n_failed: int
@@ -59,6 +60,7 @@ class Source(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
     def pictures(self) -> Iterator[Picture]: ...
+    def pictures_from(self, share: float) -> Iterator[av.VideoFrame]: ...
     def fields(
         self, pictures: Iterable[Picture], mode: str, order: str, everything: bool
     ) -> Iterator[Picture]: ...
@@ -89,7 +91,9 @@ class ContainerSource:
         self.warnings: list[str] = []
         self._n_other_size = 0
         self._n_concealed = self._n_corrupt = 0
-        self._n_discarded = 0  # packets that an edit list leaves out: decoded for those after them, never shown
+        self._n_discarded = (
+            0  # packets that an edit list leaves out: decoded for those after them, never shown
+        )
         self._first_s = self._last_s = math.nan
         self._container = _open(path)
         try:
@@ -112,7 +116,7 @@ class ContainerSource:
         self.timecode = self._find_timecode()
         # FFmpeg's AVFieldOrder: 2 .. 5 are the interlaced ones; of 4 and 5 the second letter is the order of display.
         stated = int(getattr(stream.codec_context, "field_order", 0) or 0)
-        self.says_interlaced = stated >= 2
+        self.says_interlaced, self.says_progressive = stated >= 2, stated == 1
         self.field_order = {2: "tff", 3: "bff", 4: "bff", 5: "tff"}.get(stated, "")
         n_streams = sum(s.codec_context is not None for s in _video_streams(self._container))
         if n_streams > 1:
@@ -143,6 +147,18 @@ class ContainerSource:
             self._n_concealed += bool(frame.is_corrupt)
             yield Picture(video=frame, source_frame=number, pts_s=pts_s, frame_start_s=pts_s)
             number += 1
+
+    def pictures_from(self, share: float) -> Iterator[av.VideoFrame]:
+        """Pictures from about this share of the clip on, for a look; nothing is counted. None where nobody can seek."""
+        if not math.isfinite(self.duration_s):
+            return
+        start = self._container.start_time or 0
+        try:
+            self._container.seek(start + round(share * self.duration_s * av.time_base))
+            for packet in self._container.demux(self._stream):
+                yield from packet.decode()
+        except (av.error.FFmpegError, OSError):
+            return
 
     def _decoded(self) -> Iterator[av.VideoFrame]:
         packets = self._container.demux(self._stream)
@@ -246,7 +262,7 @@ class ImageSource:
         self.codec_name = files[0].suffix[1:].lower()
         self.pixel_aspect = None
         self.timecode = None
-        self.says_interlaced = False
+        self.says_interlaced, self.says_progressive = False, True
         self.field_order = ""
         self.n_failed = 0
         self.warnings = [f"images carry no time: {options.image_fps:g} pictures/s taken (decode.image_fps)"]
@@ -283,6 +299,10 @@ class ImageSource:
             pts_s = position / self.fps
             yield Picture(video=frame, source_frame=number, pts_s=pts_s, frame_start_s=pts_s)
             number += 1
+
+    def pictures_from(self, share: float) -> Iterator[av.VideoFrame]:
+        """None: images have no fields to look for."""
+        return iter(())
 
     def fields(
         self, pictures: Iterable[Picture], mode: str, order: str, everything: bool

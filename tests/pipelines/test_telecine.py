@@ -75,6 +75,35 @@ def test_a_scene_at_rest_keeps_the_rate(tmp_path: Path) -> None:
     assert np.diff(pts_s) == pytest.approx(FILM_S, abs=1.1e-3)
 
 
+def opened_by(opening: list[np.ndarray], path: Path, n_film: int = 60) -> Path:
+    """Frames as they are, then film in 60i that goes on from frame 0 of its cycle."""
+    pictures = [*opening, *(woven(k, "telecine_tff") for k in range(n_film))]
+    grey = [np.rint(p).astype(np.uint8) for p in pictures]
+    return write_clip(path, len(grey), size=SIZE, fps=NTSC, pictures=grey)
+
+
+@pytest.mark.parametrize("n_before", [40, 130])
+@pytest.mark.parametrize("rest", [True, False], ids=["at_rest", "moving"])
+def test_film_that_begins_after_an_opener_is_put_together(tmp_path: Path, n_before: int, rest: bool) -> None:
+    opener = [luma(0 if rest else k % 40) for k in range(n_before)]
+    pictures, _, _ = decoded(opened_by(opener, tmp_path / "a.mkv"))
+    film = [p for p in pictures if p >= 0][-30:]
+    assert film == list(range(film[0], film[0] + 30))
+
+
+def test_film_after_the_first_ten_seconds_is_looked_for_all_over_the_clip(tmp_path: Path) -> None:
+    path = opened_by([luma(0)] * 400, tmp_path / "a.mkv", n_film=250)
+    with open_clip(path) as clip:
+        assert clip.facts.scan_seen == "telecine_tff" and clip.facts.deinterlace == "fieldmatch"
+
+
+def test_a_clip_that_is_progressive_throughout_stays_so(tmp_path: Path) -> None:
+    pictures = [np.rint(luma(k % 50)).astype(np.uint8) for k in range(60)]
+    with open_clip(write_clip(tmp_path / "a.mkv", 60, size=SIZE, fps=NTSC, pictures=pictures)) as clip:
+        assert (clip.facts.scan_seen, clip.facts.deinterlace) == ("progressive", "none")
+        assert len(list(clip)) == 60
+
+
 def test_left_alone_when_asked(tmp_path: Path) -> None:
     path = film_clip(tmp_path / "a.mkv", 0, 20)
     with open_clip(path, DecodeOptions(deinterlace="off")) as clip:
