@@ -1,11 +1,10 @@
-"""What moves in the frames of a panorama: found by comparing each frame with the composite itself, in rounds.
+"""What moves in the frames of a panorama: found by comparing each frame with the ground behind it.
 
 A median cannot know who is the ground where a player covers it in half of the views. But he is wider than the place
 where he covers it so often: elsewhere he stands before ground that most views agree on, and there he is seen to
-differ from it. Where he covers it in most views, his outline tells: it is there in the composite, and not in the few
-frames that show the ground (contest.py). What these agree on is taken for the ground, all other views of the place
-are distrusted, and the next round's composite is free of more of him. All of it happens at a fraction of the
-resolution: cost is a few per cent of the final composite per round.
+differ from it. That is how bodies look in this shot (appearance.py), and with it the ground is told from them where the
+views disagree (ground.py); what was decided tells the looks once more, in rounds. All of it happens at a fraction of
+the resolution; in the end every frame gets a plane that says where it shows the ground.
 """
 
 from __future__ import annotations
@@ -13,13 +12,15 @@ from __future__ import annotations
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mosaic.appearance import Appearance, classes_of, count_classes, learn
 from mosaic.canvas import Canvas
-from mosaic.contest import GHOST, SAME_GREY, Correction, GroundVote, apart, verdict
+from mosaic.ground import SAME_GREY, Witness, apart, decide, evidence
 from mosaic.motion import expand_map, local_contrast
 from mosaic.surface import Placement, Surface
 from mosaic.tile_maps import GRID_PX, Scene
@@ -36,68 +37,107 @@ DIFFERENT_GREY = (
     14.0  # a difference beyond this and 2 x the spread of the views is one; codec noise of a mean is 2..4
 )
 CERTAIN = 0.7 * 255  # share of the votes near the value: there the composite is taken for the ground
-MIN_SEED = (
-    0.2  # share of certain pixels in a region that differs, below which the composite itself may be wrong
-)
-STRANGE = (
-    2.0  # times the usual distance from the ground round about, beyond which a colour does not belong there
-)
-GROUND_PX, GROUND_SHRINK = (
-    100,
-    4,
-)  # small px: side of the neighbourhood, and the reduction at which it is looked at
-PLAIN_GREY = 16.0  # usual distance from the ground round about, above which that is no plain ground
-HALO, LIFTED = 8, 150  # trust close round what moves; and there where the colour is that of the plain ground
+BODY_GREY = 30.0  # what differs by more from ground that is certain tells how bodies look
+HALO = 8  # trust close round what moves
 NEAR, NEAR_AREA_PX = 100, 30  # trust about a body, and small px of the least piece taken for one
 AGREE = 0.8 * 255  # support from which views are taken to agree
 STEP_PX = 16  # spacing of exact map points in the small frame
 
 
-Planes = list[NDArray[np.uint8]]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Small:
+    """A view at the small scale: picture (h, w, 3), levelled; known (h, w) uint8: its plane of before, 0 = not the
+    scene; trust (h, w) uint8: as it was stored; nodes of the map to the small surface; shrink: frame px per px."""
+
+    placement: Placement
+    picture: NDArray[np.uint8]
+    known: NDArray[np.uint8]
+    trust: NDArray[np.uint8]
+    nodes: NDArray[np.float64]
+    shrink: int
+
+    def at(self) -> NDArray[np.float32]:
+        """Where on the surface its pixels lie (h, w, 2)."""
+        return expand_map(self.nodes, STEP_PX, (self.picture.shape[1], self.picture.shape[0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ground:
+    """On the small surface: image (h, w, 3); sure (h, w) uint8, 1 where it is taken for the ground; contested (h, w)
+    uint8, 1 where the views disagree."""
+
+    image: NDArray[np.uint8]
+    sure: NDArray[np.uint8]
+    contested: NDArray[np.uint8]
 
 
 def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.uint8]]:
     """A plane (h / m, w / m) uint8 per view, m about w / 320, more in a huge panorama: 255 at rest, DISTRUSTED where
     something moves. And a plane over the surface at the same scale: 1 where all views agree.
 
-    scene.still, when given, is where the rounds start, and what is low there stays low. Raises ValueError for no
-    round."""
+    scene.still, when given, is where it starts, and what is low there stays low, unless it shows the very ground that
+    was decided for. Raises ValueError for no round."""
     if scene.options.motion_rounds < 1:
         raise ValueError(f"{scene.options.motion_rounds} rounds find nothing")
     width = scene.views[0].size_px[0]
     area = scene.surface.width * scene.surface.height
     shrink = max(1, round(width / SMALL_WIDTH_PX), int(np.ceil(np.sqrt(area / MOST_SMALL_PX))))
     small = _small_scene(scene, shrink)
-    nodes = [_map_nodes(placement, small.surface, shrink) for placement in scene.views]
-    everywhere = np.full((1, 1), 255, np.uint8)
-    known: Planes = [everywhere] * len(scene.views) if scene.still is None else list(scene.still)
-    still = scene.still
+    layers = paint(small, Canvas(tempfile.gettempdir(), 1 << 30))
+    quiet = _quiet(layers, scene.options, shrink)
+    contested = quiet == 0
+    sure = (layers.support > CERTAIN) & (layers.spread <= 2 * scene.options.doubt)
+    ground = _Ground(layers.image, sure.astype(np.uint8), contested.astype(np.uint8))
     with ThreadPoolExecutor(scene.options.threads) as pool:
+        views = list(pool.map(partial(_small_view, small, shrink=shrink), range(len(scene.views))))
         for _ in range(scene.options.motion_rounds):
-            layers = paint(replace(small, still=still), Canvas(tempfile.gettempdir(), 1 << 30))
+            moving = np.sum(list(pool.map(partial(_bodies, ground=ground), views)), axis=0)
+            look = learn(ground.image, layers.n_seen > 0, moving)
+            witnesses = list(pool.map(partial(_witness, look=look), views))
+            image, moments = decide(witnesses, layers.image, contested, small.surface, scene.options.threads)
+            known = np.where(contested, moments > 1, sure)
+            ground = replace(ground, image=image, sure=known.astype(np.uint8))
+        before = scene.still or (None,) * len(views)
+        planes = list(pool.map(partial(_still_plane, ground=ground, look=look), views, before))
+    return tuple(planes), quiet
 
-            ground = _surroundings(layers)
 
-            def compare(
-                index: int, layers: Layers = layers, ground: Ground = ground, known: Planes = known
-            ) -> _Compared:
-                return _compare(small, index, layers, ground, nodes[index], shrink, known[index])
+def _small_view(scene: Scene, index: int, shrink: int) -> _Small:
+    placement = scene.views[index]
+    stored = scene.store.get(placement.frame, shrink)
+    height, width = stored.rgb.shape[:2]
+    known = np.full((height, width), 255, np.uint8)
+    if scene.still is not None:
+        known = np.asarray(cv2.resize(scene.still[index], (width, height), interpolation=cv2.INTER_NEAREST))
+    trust = np.full((height, width), 255, np.uint8) if stored.trust is None else stored.trust
+    known = np.where(trust > 0, known, np.uint8(0))
+    return _Small(
+        placement=placement, picture=_levelled(stored.rgb, scene.gains[index], scene.falloff),
+        known=np.asarray(known, np.uint8), trust=trust, nodes=_map_nodes(placement, scene.surface, shrink),
+        shrink=shrink,
+    )  # fmt: skip
 
-            compared = list(pool.map(compare, range(len(scene.views))))
-            correction = _correction(scene, compared, nodes, layers)
 
-            def judge(
-                index: int,
-                compared: list[_Compared] = compared,
-                correction: Correction = correction,
-                known: Planes = known,
-            ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-                return _still_plane(compared[index], nodes[index], correction, known[index])
+def _bodies(view: _Small, ground: _Ground) -> NDArray[np.int64]:
+    """Counts of the classes (appearance.py) of what stands before ground that is certain."""
+    at = view.at()
+    behind = cv2.remap(ground.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    sure = cv2.remap(ground.sure, at[..., 0], at[..., 1], cv2.INTER_NEAREST)
+    differs = (apart(view.picture, behind) > BODY_GREY) & (sure > 0) & (view.known > 0)
+    inner = cv2.erode(differs.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return count_classes(classes_of(view.picture), np.asarray(inner))
 
-            planes = list(pool.map(judge, range(len(scene.views))))
-            still, known = tuple(plane for plane, _ in planes), [corrected for _, corrected in planes]
-    assert still is not None
-    return still, _quiet(layers, scene.options, shrink)
+
+def _witness(view: _Small, look: Appearance) -> Witness:
+    says = look.ratio(view.picture, view.at())
+    # Not `known`: round what moved it distrusts ground, which may be seen in few frames.
+    says += np.log(np.maximum(view.trust, 1) / np.float32(255))
+    where = view.nodes[(view.nodes > -1e5).all(axis=-1)]
+    box = (*where.min(axis=0), *where.max(axis=0)) if len(where) else (0.0, 0.0, 0.0, 0.0)
+    return Witness(
+        placement=view.placement, picture=np.dstack([view.picture, evidence(says)]),
+        usable=(view.known > 0).astype(np.uint8), shrink=view.shrink, box=(box[0], box[1], box[2], box[3]),
+    )  # fmt: skip
 
 
 def _quiet(layers: Layers, options: CompositeOptions, shrink: int) -> NDArray[np.uint8]:
@@ -124,71 +164,11 @@ def _small_scene(scene: Scene, shrink: int) -> Scene:
     lattice = Lattice(
         x_px=scene.lattice.x_px / shrink, y_px=scene.lattice.y_px / shrink, rays=scene.lattice.rays
     )
-    # Painted in every round: the maps are kept, and need not be finer than the comparison.
+    # The maps need not be finer than the comparison.
     return replace(
         scene, surface=surface, lattice=lattice, options=replace(scene.options, tile_px=256, cubic=False),
-        map_error_px=0.1 * shrink, maps={}, fillers={},
+        map_error_px=0.1 * shrink,
     )  # fmt: skip
-
-
-Ground = tuple[NDArray[np.uint8], NDArray[np.float32]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Compared:
-    """One small frame against the composite: picture (h, w, 3), levelled; (h, w) bool: moves, where it shows an object
-    before the composite's ground; ghost, where the composite shows one and the frame ground; plain, where the frame
-    shows just what the plain ground round about is."""
-
-    picture: NDArray[np.uint8]
-    moves: NDArray[np.bool_]
-    ghost: NDArray[np.bool_]
-    plain: NDArray[np.bool_]
-
-
-def _compare(
-    scene: Scene,
-    index: int,
-    layers: Layers,
-    ground: Ground,
-    nodes: NDArray[np.float64],
-    shrink: int,
-    known: NDArray[np.uint8],
-) -> _Compared:
-    stored = scene.store.get(scene.views[index].frame, shrink)
-    height, width = stored.rgb.shape[:2]
-    at = expand_map(nodes, STEP_PX, (width, height))
-    truth = np.asarray(cv2.remap(layers.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.uint8)
-    facts = np.stack([layers.support, layers.n_seen], axis=-1)
-    support, n_seen = np.moveaxis(cv2.remap(facts, at[..., 0], at[..., 1], cv2.INTER_NEAREST), -1, 0)
-    frame = _levelled(stored.rgb, scene.gains[index], scene.falloff)
-    # Fine detail that lies a fraction of a pixel off differs without moving: allow for what a neighbour would explain.
-    detail = local_contrast(truth)
-    seen = (n_seen > 1) & (cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
-    if stored.trust is not None:
-        seen &= stored.trust > 0
-    differs = (apart(frame, truth) > DIFFERENT_GREY + 0.25 * detail) & seen
-    opened = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    n, found = cv2.connectedComponents(opened, connectivity=8)
-    labels = np.asarray(found, np.int32)
-    area = np.bincount(labels.ravel(), minlength=n)
-    certain = np.bincount(labels.ravel(), weights=(support.ravel() > CERTAIN), minlength=n)
-    seed = certain > MIN_SEED * area
-    seed[0] = False
-    outline = verdict(frame, truth, labels, area)
-    around, usual = (cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR) for picture in ground)
-    here, there = apart(frame, around), apart(truth, around)
-    strange, on_plain = STRANGE * usual + DIFFERENT_GREY, usual < PLAIN_GREY
-    fits = on_plain & (0.5 * there > here) & (there > strange)
-    misfits = on_plain & (0.5 * here > there) & (here > strange)
-    differs = opened > 0
-    ghost = differs & (fits | (outline < GHOST)) & ~misfits
-    return _Compared(
-        picture=frame,
-        moves=differs & ~ghost & (misfits | seed[labels] & (outline > 0)),
-        ghost=ghost,
-        plain=on_plain & (here < 1.5 * usual + 0.5 * DIFFERENT_GREY),
-    )
 
 
 def _levelled(
@@ -205,73 +185,35 @@ def _levelled(
     return np.asarray(np.minimum(levelled * light[..., None], 255).astype(np.uint8))
 
 
-def _surroundings(layers: Layers) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Colour (h, w, 3) of the ground round about each pixel, and how far pixels there usually are from it (h, w).
-
-    Medians over a neighbourhood wider than a body: on a pitch that is grass, in a crowd the spread says that it means
-    nothing."""
-    height, width = layers.n_seen.shape
-    size = (max(1, width // GROUND_SHRINK), max(1, height // GROUND_SHRINK))
-    side = 2 * (GROUND_PX // (2 * GROUND_SHRINK)) + 1
-    tiny = np.asarray(cv2.resize(layers.image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    colour = cv2.resize(cv2.medianBlur(tiny, side), (width, height), interpolation=cv2.INTER_LINEAR)
-    away = cv2.resize(
-        apart(layers.image, np.asarray(colour, np.uint8)), size, interpolation=cv2.INTER_NEAREST
-    )
-    usual = cv2.medianBlur(np.clip(np.rint(away), 0, 255).astype(np.uint8), side).astype(np.float32)
-    return np.asarray(colour, np.uint8), np.asarray(
-        cv2.resize(usual, (width, height), interpolation=cv2.INTER_LINEAR), np.float32
-    )
-
-
-def _correction(
-    scene: Scene, compared: list[_Compared], nodes: list[NDArray[np.float64]], layers: Layers
-) -> Correction:
-    """Where the frames that show ground agree that the composite shows an object, and on what is there instead."""
-    height, width = layers.n_seen.shape
-    vote = GroundVote((height, width))
-    for view, one, corners in zip(scene.views, compared, nodes, strict=True):
-        if one.ghost.any():
-            at = expand_map(corners, STEP_PX, (one.ghost.shape[1], one.ghost.shape[0]))
-            vote.add(view.frame, one.picture, one.ghost, at)
-    return vote.correct(layers.image, DIFFERENT_GREY)
-
-
 def _still_plane(
-    one: _Compared, nodes: NDArray[np.float64], correction: Correction, known: NDArray[np.uint8]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """What moves in a frame, closed to whole bodies; and `known` for the next round.
-
-    known: a plane of before, at any resolution; what is low there stays low, but for a halo that is plain ground.
-    Where the composite was corrected the frame is trusted when it shows the ground that was voted for, else not."""
-    height, width = one.moves.shape
+    view: _Small, before: NDArray[np.uint8] | None, ground: _Ground, look: Appearance
+) -> NDArray[np.uint8]:
+    """Where a frame shows the ground, closed to whole bodies. before: its plane of before, at any resolution."""
+    width = view.known.shape[1]
+    at = view.at()
+    behind = np.asarray(cv2.remap(ground.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.uint8)
+    contested = cv2.remap(ground.contested, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0
+    off = apart(view.picture, behind)
+    # Fine detail that lies a fraction of a pixel off differs without moving: allow for what a neighbour would explain.
+    differs = (off > DIFFERENT_GREY + 0.25 * local_contrast(behind)) & (view.known > 0)
+    # A sharp frame differs from smeared ones that outvote it: smeared it would be like them, and it looks like ground.
+    square = np.ones((5, 5), np.uint8)
+    smeared = np.clip(behind, cv2.erode(view.picture, square), cv2.dilate(view.picture, square))
+    spared = contested & (apart(smeared, behind) < SAME_GREY) & (look.ratio(view.picture, at) > 0)
+    differs &= ~spared
+    core = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    shows = contested & (off < SAME_GREY) & (view.known > 0)
     side = 2 * max(2, round(width / 40)) + 1  # bridges a gap of a twentieth of the width
-    if known.shape != (height, width):  # finer planes keep outlines that the comparison does not see
-        known = np.asarray(cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
-    core = one.moves.astype(np.uint8)
-    shows = np.zeros((height, width), bool)
-    if correction.accepted.any():
-        at = expand_map(nodes, STEP_PX, (width, height))
-        wrong = cv2.remap(correction.accepted, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0
-        ground = np.asarray(cv2.remap(correction.ground, at[..., 0], at[..., 1], cv2.INTER_NEAREST), np.uint8)
-        agrees = apart(one.picture, ground) < SAME_GREY
-        shows, hides = wrong & agrees, wrong & ~agrees
-        core |= hides.astype(np.uint8)
-        known = np.where(_resized(hides, known) & (known > DISTRUSTED), np.uint8(DISTRUSTED), known)
-        known[_resized(shows, known) & (known > 0)] = 255
     body = cv2.dilate(cv2.morphologyEx(core, cv2.MORPH_CLOSE, _disc(side), borderValue=0), _disc(5))
     # Who was seen moving stands as close by.
-    moving = cv2.resize(known, (width, height), interpolation=cv2.INTER_NEAREST) <= DISTRUSTED
-    plane = _near_bodies(np.maximum(body, moving.astype(np.uint8)))
+    plane = _near_bodies(np.maximum(body, (view.known <= DISTRUSTED).astype(np.uint8)))
     plane[body > 0] = HALO
     plane[core > 0] = DISTRUSTED
+    known = view.known if before is None or before.size == 1 else before  # finer planes keep their outlines
     size = (known.shape[1], known.shape[0])
     plane = np.minimum(cv2.resize(plane, size, interpolation=cv2.INTER_NEAREST), known)
-    plain = _resized(one.plain, known)
-    plane[plain & (plane == NEAR)] = 255
-    plane[plain & (plane == HALO)] = LIFTED
     plane[_resized(shows, known) & (known > 0)] = 255
-    return np.asarray(plane, np.uint8), np.asarray(known, np.uint8)
+    return np.asarray(plane, np.uint8)
 
 
 def _resized(flags: NDArray[np.bool_], like: NDArray[np.uint8]) -> NDArray[np.bool_]:

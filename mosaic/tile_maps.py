@@ -29,9 +29,8 @@ class Scene:
     views.lattice_of, of which floor (ny, nx) and vote (n, ny, nx), 0 = does not count, are tables. still: a plane
     (h, w) uint8 per view over its frame, at any resolution: 255 = at rest, low = something moves there; None = all
     at rest. quiet: (h, w) uint8 over the surface at any resolution, not 0 where all views are known to agree; None =
-    nowhere. map_error_px: how far the interpolated map may be from the exact one, in frame px. maps, fillers: where
-    given, tile_maps and fallback_maps of a tile are kept in them, for a scene that is painted more than once. deep:
-    paint with all the bits that the store has."""
+    nowhere. map_error_px: how far the interpolated map may be from the exact one, in frame px. deep: paint with all the
+    bits that the store has."""
 
     surface: Surface
     store: FrameStore
@@ -45,8 +44,6 @@ class Scene:
     still: tuple[NDArray[np.uint8], ...] | None = None
     quiet: NDArray[np.uint8] | None = None
     map_error_px: float = 0.02
-    maps: dict[tuple[int, int], list[TileMap]] | None = None
-    fillers: dict[tuple[int, int], list[TileMap]] | None = None
     deep: bool = False
 
 

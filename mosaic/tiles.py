@@ -73,20 +73,11 @@ def _tile(
     scene: Scene, x0: int, y0: int, width: int, height: int, backwards: bool, local: threading.local
 ) -> Blended | None:
     """One tile; None where no view reaches it."""
-    maps = scene.maps.get((x0, y0)) if scene.maps is not None else None
-    if maps is None:
-        maps = tile_maps(scene, x0, y0, width, height)
-        if scene.maps is not None:
-            scene.maps[x0, y0] = maps
-    tile = _blended(scene, maps, width, height, backwards, local)
+    tile = _blended(scene, tile_maps(scene, x0, y0, width, height), width, height, backwards, local)
     empty = tile.n_seen == 0
     if empty.any():
         # The lattice's rules leave out who sees a place too coarsely, or in a strip between its points.
-        others = scene.fillers.get((x0, y0)) if scene.fillers is not None else None
-        if others is None:
-            others = fallback_maps(scene, x0, y0, empty)
-            if scene.fillers is not None:
-                scene.fillers[x0, y0] = others
+        others = fallback_maps(scene, x0, y0, empty)
         if others:
             filling = _blended(scene, others, width, height, backwards, local)
             for layer, fill in zip(tile, filling, strict=True):

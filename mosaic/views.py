@@ -37,8 +37,8 @@ class CompositeOptions:
     that is not used, and share of its width over which its weight rises. cubic: Catmull-Rom, else linear.
     floor, cap, doubt: grey levels, see blend.robust_value. max_views: most views of one tile (memory).
     threads: tiles worked on at once. memory_bytes: an image larger than this lives in a file in the scratch folder.
-    gains: level the exposure of the views and the lens's falloff. motion_rounds: rounds of looking
-    for what moves (moving.py): each lifts slow players a little more, 3 reach what 6 do within .3 dB; 0 = none.
+    gains: level the exposure of the views and the lens's falloff. motion_rounds: rounds of learning
+    what bodies look like and of deciding what the ground is (moving.py): the third and fourth change .1 dB; 0 = none.
     quiet_views: views sampled where all agree about what they show (moving.py): 7 to 25 differ by .05 dB there, and
     half of the time goes into sampling.
     max_candidates: frames looked at when planning; a longer clip is thinned, the least blurred of each group stays.
@@ -63,7 +63,7 @@ class CompositeOptions:
     memory_bytes: int = 200_000_000
     max_candidates: int = 1200
     gains: bool = True
-    motion_rounds: int = 3
+    motion_rounds: int = 2
     quiet_views: int = 9
 
     def __post_init__(self) -> None:
