@@ -18,20 +18,18 @@ from numpy.typing import NDArray
 from mosaic.motion import local_contrast
 
 LEVELS = 8  # of each channel
-PLAIN, BUSY = (
-    14,
-    40,
-)  # local contrast, grey levels: below the one cloth and grass, above the other letters and crowds
+# Local contrast, grey levels: cloth and grass below the first, letters and crowds above the second.
+PLAIN, BUSY = 14, 40
 N_CLASSES = LEVELS**3 * 3
 CELL_PX = (8, 32)  # rows and columns of the surface whose pixels are counted together
-AROUND = (
-    1,
-    3,
-)  # cells up and down, and to both sides, that say what the ground there looks like: it lies in rows
+# Cells up and down, and to both sides, that say what the ground there looks like. It lies in rows, and a heap of bodies
+# that won the median must not be the ground's own witness: two widths of a frame to either side.
+AROUND = (1, 20)
+SURE = 9  # a pixel that is taken for the ground counts as so many that are contested
 PRIOR = 0.5  # pixels of every class that are taken for seen
 MOST = 6.0  # nats that one pixel may say
 OUTLINE_PX = (
-    2.0  # sigma over which neighbours speak for each other: 1 tells limbs, 3 the trunks of a crowd of bodies
+    2.0  # sigma over which neighbours speak for each other: 1 finds limbs, 3 trunks in a crowd of bodies
 )
 
 Picture = NDArray[np.uint8]
@@ -71,22 +69,29 @@ class Appearance(NamedTuple):
         return np.asarray(cv2.GaussianBlur(np.clip(says, -MOST, MOST), (0, 0), OUTLINE_PX), np.float32)
 
 
-def learn(composite: Picture, seen: NDArray[np.bool_], moving: NDArray[np.int64]) -> Appearance:
-    """The appearance from a composite (h, w, 3), where it was seen (h, w), and counts of what moves (N_CLASSES,)."""
+def learn(
+    composite: Picture, seen: NDArray[np.bool_], sure: NDArray[np.bool_], moving: NDArray[np.int64]
+) -> Appearance:
+    """The appearance from a composite (h, w, 3), where it was seen and where it is taken for the ground (h, w), and
+    counts of what moves (N_CLASSES,)."""
     height, width = seen.shape
     rows, columns = -(-height // CELL_PX[0]), -(-width // CELL_PX[1])
     classes = classes_of(composite)
+    weight = np.where(seen, np.where(sure, SURE, 1), 0)
     cell = np.arange(width) // CELL_PX[1]
-    counts = np.zeros((rows, columns, N_CLASSES), np.uint16)  # a cell has 256 pixels
+    counts = np.empty((rows, columns, N_CLASSES), np.uint16)  # at most SURE times 256 pixels
     for row in range(rows):
         band = np.s_[row * CELL_PX[0] : (row + 1) * CELL_PX[0]]
-        index = (cell * N_CLASSES + classes[band])[seen[band]]
-        counts[row] = np.bincount(index, minlength=columns * N_CLASSES).reshape(columns, N_CLASSES)
+        index = cell * N_CLASSES + classes[band]
+        counted = np.bincount(index.ravel(), weight[band].ravel(), columns * N_CLASSES)
+        counts[row] = counted.reshape(columns, N_CLASSES)
+    first = np.maximum(np.arange(columns) - AROUND[1], 0)
+    last = np.minimum(np.arange(columns) + AROUND[1] + 1, columns)
     ground = np.empty(counts.shape, np.float16)
     for row in range(rows):
-        near = counts[max(row - AROUND[0], 0) : row + AROUND[0] + 1].sum(axis=0, dtype=np.float32)
-        wide = np.array([near[max(i - AROUND[1], 0) : i + AROUND[1] + 1].sum(axis=0) for i in range(columns)])
-        ground[row] = _log_share(wide)
+        near = counts[max(row - AROUND[0], 0) : row + AROUND[0] + 1].sum(axis=0, dtype=np.int64)
+        before = np.concatenate([np.zeros((1, N_CLASSES), np.int64), np.cumsum(near, axis=0)])
+        ground[row] = _log_share((before[last] - before[first]).astype(np.float32) / SURE)
     return Appearance(body=_log_share(moving[None].astype(np.float32))[0], ground=ground)
 
 

@@ -19,11 +19,20 @@ from numpy.typing import ArrayLike, NDArray
 from mosaic.canvas import Canvas
 from mosaic.framestore import COARSE, FrameStore
 from mosaic.gains import solve_log_gains
-from mosaic.moving import find_still
+from mosaic.moving import find_still, shown_clear
 from mosaic.surface import Placement, Surface
 from mosaic.tile_maps import Scene
 from mosaic.tiles import paint
-from mosaic.views import CompositeOptions, Lattice, ViewPlan, lattice_of, plan_views, rate_views, share_views
+from mosaic.views import (
+    CompositeOptions,
+    Lattice,
+    Rating,
+    ViewPlan,
+    lattice_of,
+    plan_views,
+    rate_views,
+    share_views,
+)
 from mosaic.vignetting import N_BLOCKS, NONE, corner, log_falloff, radius_squared, solve_falloff
 
 __all__ = ["Canvas", "CompositeOptions", "FrameStore", "Panorama", "ViewPlan", "composite", "plan_views"]
@@ -104,16 +113,18 @@ def composite(
         if k in store and k in by_frame and np.isfinite(by_frame[k].px_per_rad)
     ]
     lattice = lattice_of(surface)
-    views, floor, vote = _final_views(stored, lattice, surface, options)
+    views, rating, vote = _final_views(stored, lattice, surface, options)
     light = solve_light(store, views, surface) if options.gains else Light(np.ones((len(views), 3)), NONE)
     scene = Scene(
         surface=surface, store=store, views=views, gains=light.gains.astype(np.float32),
-        falloff=light.falloff, lattice=lattice, floor=floor.reshape(vote.shape[1:]), vote=vote, options=options,
+        falloff=light.falloff, lattice=lattice, floor=rating.floor.reshape(vote.shape[1:]), vote=vote, options=options,
         still=tuple(store.still(p.frame) for p in views),
     )  # fmt: skip
     if options.motion_rounds > 0:
         still, quiet = find_still(scene)
-        scene = replace(scene, still=still, quiet=quiet)
+        clear = shown_clear(still, views, lattice, surface)
+        vote = share_views(views, rating, lattice, surface.scale_px, options, clear)
+        scene = replace(scene, still=still, quiet=quiet, vote=vote)
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     layers = paint(replace(scene, deep=store.deep), canvas, progress)
     alpha = canvas.zeros(layers.n_seen.shape)
@@ -130,8 +141,8 @@ def composite(
 
 def _final_views(
     stored: Sequence[Placement], lattice: Lattice, surface: Surface, options: CompositeOptions
-) -> tuple[tuple[Placement, ...], NDArray[np.float64], NDArray[np.float32]]:
-    """Views in use, the resolution floor (p,) and votes (n, ny, nx), with the final placements."""
+) -> tuple[tuple[Placement, ...], Rating, NDArray[np.float32]]:
+    """Views in use, their rating and votes (n, ny, nx), with the final placements."""
     if not stored:
         raise ValueError("no stored frame has a placement: nothing to composite")
     rating = rate_views(stored, lattice, options)
@@ -139,7 +150,7 @@ def _final_views(
     if not vote.any():
         raise ValueError(f"none of {len(stored)} stored frames sees the panorama")
     # Also those without a vote: a strip between lattice points may have nobody else.
-    return tuple(stored), rating.floor, vote
+    return tuple(stored), rating, vote
 
 
 class Light(NamedTuple):

@@ -10,6 +10,7 @@ the resolution; in the end every frame gets a plane that says where it shows the
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -92,7 +93,7 @@ def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.
         views = list(pool.map(partial(_small_view, small, shrink=shrink), range(len(scene.views))))
         for _ in range(scene.options.motion_rounds):
             moving = np.sum(list(pool.map(partial(_bodies, ground=ground), views)), axis=0)
-            look = learn(ground.image, layers.n_seen > 0, moving)
+            look = learn(ground.image, layers.n_seen > 0, ground.sure > 0, moving)
             witnesses = list(pool.map(partial(_witness, look=look), views))
             image, moments = decide(witnesses, layers.image, contested, small.surface, scene.options.threads)
             known = np.where(contested, moments > 1, sure)
@@ -100,6 +101,25 @@ def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.
         before = scene.still or (None,) * len(views)
         planes = list(pool.map(partial(_still_plane, ground=ground, look=look), views, before))
     return tuple(planes), quiet
+
+
+def shown_clear(
+    still: Sequence[NDArray[np.uint8]], views: Sequence[Placement], lattice: Lattice, surface: Surface
+) -> NDArray[np.float32]:
+    """Share 0..1 of the ground that each view shows round each lattice point, to the next points, (n, p).
+
+    still: as find_still gives it."""
+    spacing = max(np.diff(lattice.x_px).max(), np.diff(lattice.y_px).max())
+    shown = np.zeros((len(views), len(lattice.rays)), np.float32)
+    for row, (plane, placement) in enumerate(zip(still, views, strict=True)):
+        height, width = plane.shape
+        per_px = width / placement.size_px[0]
+        side = 2 * int(spacing / surface.scale_px * placement.px_per_rad * per_px / 2) + 1
+        mean = cv2.blur(plane, (side, side))
+        at = np.nan_to_num((placement.ray_to_pixel(lattice.rays) + 0.5) * per_px - 0.5, nan=-1e6)
+        x, y = np.clip(np.rint(at), 0, [width - 1, height - 1]).astype(np.intp).T
+        shown[row] = mean[y, x] / np.float32(255)
+    return shown
 
 
 def _small_view(scene: Scene, index: int, shrink: int) -> _Small:

@@ -21,6 +21,7 @@ from mosaic.surface import Placement, Surface
 COVER_CELLS = 600  # over the longer side of the surface: how finely coverage is looked at
 SEAM_CELLS = 4  # of these at once, of frames that lie across a seam
 STRIP_VIEWS = (2, 7)  # least and most of a strip: two that disagree say so at least, a median of 7 is robust
+LEAST_CLEAR = 0.05  # of a view's quality where it shows nothing of the ground
 LEAST_RATIO = 0.08  # of the resolution floor: a view coarser than this does not even vote
 
 
@@ -286,6 +287,7 @@ def share_views(
     lattice: Lattice,
     scale_px: float,
     options: CompositeOptions,
+    clear: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Votes 0..1 of the views at the lattice points, (n, ny, nx), 0 = does not count; interpolated in between.
 
@@ -294,6 +296,8 @@ def share_views(
     a vote: a player who stands still for two seconds is one observation, however often he was filmed meanwhile.
     A point that fewer than K see also takes the frames that nearly reach it, nearest first: a frame
     that covers a part of a lattice cell may see none of its corners. scale_px: px per radian of the surface.
+    clear (n, p), 0..1: how much of the ground about a point a view shows, where that is known; who shows more is taken
+    before others.
     """
     ny, nx = len(lattice.y_px), len(lattice.x_px)
     time = np.array([p.frame for p in placements], dtype=np.float64)
@@ -307,8 +311,9 @@ def share_views(
     coarse = np.where(
         (reach > options.margin_px) & ~fine, np.sqrt(_clipped_ratio(placements, rating.floor)), 0.0
     )
+    shown = np.ones(shape, np.float32) if clear is None else clear.reshape(shape).clip(LEAST_CLEAR, 1)
     quality, rare, near = rating.quality.reshape(shape), rating.rare.reshape(shape), near.reshape(shape)
-    coarse = coarse.reshape(shape)
+    quality, coarse = quality * shown, coarse.reshape(shape) * shown
     taken = np.zeros(shape, bool)
     before = np.zeros(shape[:2], bool)
     for column in range(nx):

@@ -6,6 +6,7 @@ import numpy as np
 from mosaic.appearance import MOST, N_CLASSES, classes_of, count_classes, learn
 
 SIZE = (80, 320)
+ALL = np.ones(SIZE, bool)
 SHIRT = np.array([215, 40, 45], np.uint8)
 
 
@@ -30,7 +31,7 @@ def look_of(shirt=SHIRT):
     where = np.zeros(SIZE, bool)
     where[52:72, 102:110] = True
     moving = count_classes(classes_of(before_grass), where)
-    return learn(ground_picture(), np.ones(SIZE, bool), 30 * moving)
+    return learn(ground_picture(), ALL, ALL, 30 * moving)
 
 
 def test_a_shirt_seen_before_grass_is_known_before_the_crowd():
@@ -50,15 +51,32 @@ def test_ground_of_the_colour_of_a_shirt_is_no_evidence_against_itself():
     where[52:72, 102:110] = True
     body = board.copy()
     body[50:74, 100:112] = SHIRT
-    look = learn(board, np.ones(SIZE, bool), 30 * count_classes(classes_of(body), where))
+    look = learn(board, ALL, ALL, 30 * count_classes(classes_of(body), where))
     # All that moves has its colour, and of what lies round about two thirds: log(2 / 3), and no more.
     assert np.median(look.ratio(board, map_of(SIZE))[22:27]) > -0.6
     assert np.median(look.ratio(body, map_of(SIZE))[56:68, 104:108]) < -2  # and before grass it still is
 
 
+def test_a_body_in_the_composite_is_no_witness_that_it_is_ground():
+    spoilt = ground_picture()
+    spoilt[4:36, 40:200] = SHIRT  # a heap that won the median over half of the width
+    where = np.zeros(SIZE, bool)
+    where[52:72, 102:110] = True
+    before_grass = ground_picture()
+    before_grass[50:74, 100:112] = SHIRT
+    moving = 30 * count_classes(classes_of(before_grass), where)
+    doubted = ALL.copy()
+    doubted[4:36, 40:200] = False
+    ratio = {
+        name: np.median(learn(spoilt, ALL, sure, moving).ratio(spoilt, map_of(SIZE))[12:28, 100:140])
+        for name, sure in (("doubted", doubted), ("believed", ALL))
+    }
+    assert ratio["doubted"] < -2 and ratio["doubted"] < ratio["believed"] - 1
+
+
 def test_where_nobody_was_seen_moving_only_the_ground_speaks():
     nothing = np.zeros(N_CLASSES, np.int64)
-    look = learn(ground_picture(), np.ones(SIZE, bool), nothing)
+    look = learn(ground_picture(), ALL, ALL, nothing)
     assert np.ptp(look.body) == 0
     assert np.median(look.ratio(ground_picture(seed=3), map_of(SIZE))) > 1
 
