@@ -21,7 +21,7 @@ from mosaic.surface import Placement, Surface
 COVER_CELLS = 600  # over the longer side of the surface: how finely coverage is looked at
 SEAM_CELLS = 4  # of these at once, of frames that lie across a seam
 STRIP_VIEWS = (2, 7)  # least and most of a strip: two that disagree say so at least, a median of 7 is robust
-LEAST_CLEAR = 0.05  # of a view's quality where it shows nothing of the ground
+LEAST_CLEAR = 0.1  # a view that shows less of the ground about a point is of no use there
 LEAST_RATIO = 0.08  # of the resolution floor: a view coarser than this does not even vote
 
 
@@ -296,8 +296,8 @@ def share_views(
     a vote: a player who stands still for two seconds is one observation, however often he was filmed meanwhile.
     A point that fewer than K see also takes the frames that nearly reach it, nearest first: a frame
     that covers a part of a lattice cell may see none of its corners. scale_px: px per radian of the surface.
-    clear (n, p), 0..1: how much of the ground about a point a view shows, where that is known; who shows more is taken
-    before others.
+    clear (n, p), 0..1: how much of the ground about a point a view shows, where that is known; where the views taken
+    show less than a third of K between them, others that show it are taken as well.
     """
     ny, nx = len(lattice.y_px), len(lattice.x_px)
     time = np.array([p.frame for p in placements], dtype=np.float64)
@@ -311,9 +311,8 @@ def share_views(
     coarse = np.where(
         (reach > options.margin_px) & ~fine, np.sqrt(_clipped_ratio(placements, rating.floor)), 0.0
     )
-    shown = np.ones(shape, np.float32) if clear is None else clear.reshape(shape).clip(LEAST_CLEAR, 1)
     quality, rare, near = rating.quality.reshape(shape), rating.rare.reshape(shape), near.reshape(shape)
-    quality, coarse = quality * shown, coarse.reshape(shape) * shown
+    coarse = coarse.reshape(shape)
     taken = np.zeros(shape, bool)
     before = np.zeros(shape[:2], bool)
     for column in range(nx):
@@ -327,7 +326,14 @@ def share_views(
         before = here
         # Coarser or blurred views of other moments cannot add detail, but may be the only ones that show the ground.
         wanted = here.sum(axis=0) + -(-options.views // 2)
-        taken[:, :, column] = _spread_in_time(coarse[:, :, column], time, wanted, here)
+        here = _spread_in_time(coarse[:, :, column], time, wanted, here)
+        if clear is not None:
+            shown = clear.reshape(shape)[:, :, column]
+            least = -(-options.views // 3)
+            more = np.where((here * shown).sum(axis=0) < least, least, 0)
+            any_view = np.maximum(quality, coarse)[:, :, column] * np.where(shown > LEAST_CLEAR, shown, 0)
+            here = _spread_in_time(any_view, time, here.sum(axis=0) + more, here)
+        taken[:, :, column] = here
     return _independence(taken.reshape(len(placements), -1), time, options.min_span).reshape(shape)
 
 

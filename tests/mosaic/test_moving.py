@@ -30,7 +30,7 @@ def test_a_view_is_clear_where_nothing_moves_about_the_point():
     assert others[..., left].max() < 0.02 and others[..., right].min() > 0.99
 
 
-def test_who_shows_the_ground_has_a_vote_before_others():
+def test_who_shows_the_ground_has_a_vote_beside_others():
     options = CompositeOptions(views=3)
     rating = rate_views(VIEWS, LATTICE, options)
     clear = shown_clear(planes(), VIEWS, LATTICE, SURFACE)
@@ -41,4 +41,5 @@ def test_who_shows_the_ground_has_a_vote_before_others():
         inner
     ].all()  # three far apart in time: the fourth of eight is none of them everywhere
     assert (told[3][inner] > 0).all()
-    assert ((told > 0).sum(axis=0) == (blind > 0).sum(axis=0)).all()
+    assert (told[blind > 0] > 0).all()  # nobody lost his
+    assert np.array_equal(told[:, :, -3:], blind[:, :, -3:])  # and where enough show the ground nothing is different
