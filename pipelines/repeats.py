@@ -23,6 +23,8 @@ class Repeats:
 
     def is_repeat(self, before: NDArray[np.generic], picture: NDArray[np.generic]) -> bool:
         """Of two coarse gray pictures (h, w), 0..255; to be asked once for each picture, in order."""
+        if before.dtype != picture.dtype:  # images of unlike depth in one folder
+            before, picture = before.astype(np.float32), picture.astype(np.float32)
         change = float(cv2.norm(cast(Any, picture), cast(Any, before), cv2.NORM_L1)) / picture.size
         usual = float(np.median(self._changes)) if len(self._changes) >= 3 else float("nan")
         if change < SAME_GREY or (change < NEARLY_SHARE * usual and change < NEARLY_GREY):
