@@ -42,4 +42,6 @@ def test_who_shows_the_ground_has_a_vote_beside_others():
     ].all()  # three far apart in time: the fourth of eight is none of them everywhere
     assert (told[3][inner] > 0).all()
     assert (told[blind > 0] > 0).all()  # nobody lost his
-    assert np.array_equal(told[:, :, -3:], blind[:, :, -3:])  # and where enough show the ground nothing is different
+    assert np.array_equal(
+        told[:, :, -3:], blind[:, :, -3:]
+    )  # and where enough show the ground nothing is different
