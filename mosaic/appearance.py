@@ -28,9 +28,8 @@ AROUND = (1, 20)
 SURE = 9  # a pixel that is taken for the ground counts as so many that are contested
 PRIOR = 0.5  # pixels of every class that are taken for seen
 MOST = 6.0  # nats that one pixel may say
-OUTLINE_PX = (
-    2.0  # sigma over which neighbours speak for each other: 1 finds limbs, 3 trunks in a crowd of bodies
-)
+# Sigma over which neighbours speak for each other: 1 finds limbs, 3 trunks in a crowd of bodies.
+OUTLINE_PX = 2.0
 
 Picture = NDArray[np.uint8]
 

@@ -91,9 +91,8 @@ class ContainerSource:
         self.warnings: list[str] = []
         self._n_other_size = 0
         self._n_concealed = self._n_corrupt = 0
-        self._n_discarded = (
-            0  # packets that an edit list leaves out: decoded for those after them, never shown
-        )
+        # Packets that an edit list leaves out: decoded for those after them, never shown.
+        self._n_discarded = 0
         self._first_s = self._last_s = math.nan
         self._container = _open(path)
         try:
