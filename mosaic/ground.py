@@ -1,5 +1,5 @@
 """What the ground is where frames disagree: of all colours seen at a place the one that comes again at most moments and
-looks least like a body (appearance.py).
+looks least like a body (appearance.py), as far as it is seen together with what is chosen round about (states.py).
 
 A median asks only how often; a body that stands or strolls wins it wherever it hides the ground in most of the frames.
 Every frame that sees a place is asked, not only those that the composite samples: the ground may show in few.
@@ -17,14 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.motion import expand_map
+from mosaic.states import EVIDENCE_STEP, NEVER, REACH, find_states, no_states, settle
 from mosaic.surface import Placement, Surface
 
 TILE_PX = 128
 STEP_PX = 8  # surface px between exact points of a map
 BORDER_PX = 2.0  # of a frame, not used
-SAME_GREY = 12  # colours that differ by less are one
-MOMENT_FRAMES = 6  # views nearer than this say the same about a place
-EVIDENCE_STEP = 1 / 20  # nats per grey level of the evidence plane, 128 = none
 
 Picture = NDArray[np.uint8]
 
@@ -72,34 +70,38 @@ def decide(
 
     witnesses: in the order of time. surface: the one whose pixels the composite has."""
     height, width = contested.shape
-    ground, moments = composite.copy(), np.zeros((height, width), np.int16)
+    states = no_states(height, width)
     corners = [(x, y) for y in range(0, height, TILE_PX) for x in range(0, width, TILE_PX)]
 
     def work(corner: tuple[int, int]) -> None:
         x, y = corner
-        box = np.s_[y : y + TILE_PX, x : x + TILE_PX]
-        if not contested[box].any():
+        # What is seen together may lie on both sides of a border.
+        wider = np.s_[y : y + TILE_PX + REACH, x : x + TILE_PX + REACH]
+        if not contested[wider].any():
             return
         here = [w for w in witnesses if _meet(w.box, x, y)]
+        part = states.part(x, y, TILE_PX)
         if not here:
+            part.value[:] = NEVER
             return
-        shape = contested[box].shape
+        shape = contested[wider].shape
         views = np.zeros((len(here), *shape, 4), np.uint8)
         seen = np.zeros((len(here), *shape), np.uint8)
         rays = _rays(surface, x, y, shape)
         for view, usable, witness in zip(views, seen, here, strict=True):
             _sample(witness, rays, view, usable)
         frames = np.array([w.placement.frame for w in here], np.int64)
-        _decide(views, seen, frames, composite[box], contested[box], ground[box], moments[box])
+        find_states(views, seen, frames, composite[wider], contested[wider], part)
 
     with ThreadPoolExecutor(threads) as pool:
         for _ in pool.map(work, corners):
             pass
-    return ground, moments
+    chosen = settle(states, contested)
+    return states.picture(chosen, composite, contested)
 
 
 def _meet(box: tuple[float, float, float, float], x: int, y: int) -> bool:
-    return box[0] < x + TILE_PX and box[2] > x and box[1] < y + TILE_PX and box[3] > y
+    return box[0] < x + TILE_PX + REACH and box[2] > x and box[1] < y + TILE_PX + REACH and box[3] > y
 
 
 def _rays(surface: Surface, x: int, y: int, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -120,50 +122,3 @@ def _sample(witness: Witness, rays: NDArray[np.float64], view: Picture, usable: 
         (x >= BORDER_PX) & (x <= width - 1 - BORDER_PX) & (y >= BORDER_PX) & (y <= height - 1 - BORDER_PX)
     )
     usable[~inside] = 0
-
-
-@numba.njit(cache=True, nogil=True)
-def _decide(views, seen, frames, composite, contested, ground, moments):  # type: ignore[no-untyped-def]
-    """Each view's colour is a candidate, and the composite's: log of the moments at which views have it, plus the mean
-    of what these views' evidence says. views (n, h, w, 4), seen (n, h, w)."""
-    n, height, width = seen.shape
-    present = np.empty(n, np.int64)
-    colour = np.empty((n + 1, 3), np.int32)
-    for i in range(height):
-        for j in range(width):
-            if not contested[i, j]:
-                continue
-            m = 0
-            for k in range(n):
-                if seen[k, i, j]:
-                    present[m] = k
-                    for c in range(3):
-                        colour[m, c] = views[k, i, j, c]
-                    m += 1
-            for c in range(3):
-                colour[m, c] = composite[i, j, c]
-            best = np.float32(-1e9)
-            for a in range(m + 1):
-                last, n_moments, n_same, says = -MOMENT_FRAMES, 0, 0, np.float32(0)
-                for b in range(m):
-                    off = (
-                        abs(colour[a, 0] - colour[b, 0])
-                        + 2 * abs(colour[a, 1] - colour[b, 1])
-                        + abs(colour[a, 2] - colour[b, 2])
-                    )
-                    if off > 4 * SAME_GREY:
-                        continue
-                    k = present[b]
-                    n_same += 1
-                    says += np.float32(views[k, i, j, 3]) - np.float32(128)
-                    if frames[k] - last >= MOMENT_FRAMES:
-                        last = frames[k]
-                        n_moments += 1
-                if n_same == 0:
-                    continue
-                value = np.log(np.float32(n_moments)) + np.float32(EVIDENCE_STEP) * says / n_same
-                if value > best:
-                    best = value
-                    moments[i, j] = n_moments
-                    for c in range(3):
-                        ground[i, j, c] = colour[a, c]

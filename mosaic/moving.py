@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from mosaic.appearance import Appearance, classes_of, count_classes, learn
 from mosaic.canvas import Canvas
-from mosaic.ground import SAME_GREY, Witness, apart, decide, evidence
+from mosaic.ground import Witness, apart, decide, evidence
 from mosaic.motion import expand_map, local_contrast
+from mosaic.states import SAME_GREY
 from mosaic.surface import Placement, Surface
 from mosaic.tile_maps import GRID_PX, Scene
 from mosaic.tiles import Layers, paint

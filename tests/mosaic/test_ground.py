@@ -63,3 +63,18 @@ def test_evidence_survives_its_eight_bits():
     back = (evidence(nats).astype(np.float32) - 128) / 20
     assert np.abs(back - nats).max() <= 0.026
     assert evidence(np.array([[-99.0, 99.0]], np.float32)).tolist() == [[0, 255]]
+
+
+def test_tiles_leave_no_trace(monkeypatch):
+    rng = np.random.default_rng(2)
+    witnesses = []
+    for k in range(7):
+        one = witness(10 * k, GROUND if k < 3 else SHIRT)
+        noisy = one.picture.copy()
+        noisy[..., :3][rng.uniform(size=noisy.shape[:2]) < 0.3] = SHIRT if k < 3 else GROUND
+        witnesses.append(Witness(one.placement, noisy, one.usable, one.shrink, one.box))
+    whole = decided(witnesses)
+    monkeypatch.setattr("mosaic.ground.TILE_PX", 24)
+    tiled = decided(witnesses)
+    assert (whole[0] == tiled[0]).all() and (whole[1] == tiled[1]).all()
+    assert len(np.unique(whole[0].reshape(-1, 3), axis=0)) > 1
