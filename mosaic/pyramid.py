@@ -66,7 +66,7 @@ def build_pyramid(
     if mask is not None:
         if mask.shape != gray.shape:
             raise ValueError(f"mask {mask.shape} does not match the picture {gray.shape}")
-        small = _quarter_mask(mask)
+        small = quarter_mask(mask)
     return Pyramid(levels=tuple(levels), scales=scales, size_px=size_px, mask=small)
 
 
@@ -77,7 +77,7 @@ def block_minimum(plane: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(least[::side, ::side], np.uint8)
 
 
-def _quarter_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def quarter_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Mask (h, w) at quarter size, 1 = usable; a quarter pixel is usable only when all of it is."""
     h, w = mask.shape
     if h % 4 == 0 and w % 4 == 0:

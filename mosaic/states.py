@@ -193,13 +193,14 @@ def _settle(value, together, node, apart, cost, sweeps):  # type: ignore[no-unty
     """Messages pass to and fro in the order of the pixels, from what is known at once (sequential updates)."""
     height, width, n = value.shape
     edges = len(apart)
-    # To each contested pixel, from the one before it along each edge, and from the one behind it.
-    message = np.zeros((node.max() + 1, 2 * edges, n), np.float32)
+    # To each contested pixel, from the one before it along each edge, and from the one behind it: what is against a
+    # state, from 0 to the edge's cost in 255 steps (a quarter of the memory of floats).
+    message = np.zeros((node.max() + 1, 2 * edges, n), np.uint8)
     belief = np.empty(n, np.float32)
     for _ in range(sweeps):
         for i in range(height):
             for j in range(width):
-                _believe(value[i, j], message, node[i, j], belief)
+                _believe(value[i, j], message, node[i, j], cost, belief)
                 for e in range(edges):
                     y, x = i + apart[e, 0], j + apart[e, 1]
                     if y < height and x < width and node[y, x] >= 0:
@@ -207,7 +208,7 @@ def _settle(value, together, node, apart, cost, sweeps):  # type: ignore[no-unty
                         _send(belief, message, node[i, j], edges + e, together[i, j, e], n, 1, cost[e], to)
         for i in range(height - 1, -1, -1):
             for j in range(width - 1, -1, -1):
-                _believe(value[i, j], message, node[i, j], belief)
+                _believe(value[i, j], message, node[i, j], cost, belief)
                 for e in range(edges):
                     y, x = i - apart[e, 0], j - apart[e, 1]
                     if y >= 0 and x >= 0 and node[y, x] >= 0:
@@ -217,20 +218,20 @@ def _settle(value, together, node, apart, cost, sweeps):  # type: ignore[no-unty
     for i in range(height):
         for j in range(width):
             if node[i, j] >= 0:
-                _believe(value[i, j], message, node[i, j], belief)
+                _believe(value[i, j], message, node[i, j], cost, belief)
                 chosen[i, j] = np.argmax(belief)
     return chosen
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _believe(value, message, node, belief):  # type: ignore[no-untyped-def]
+def _believe(value, message, node, cost, belief):  # type: ignore[no-untyped-def]
     """What a pixel makes of its states (n,), from its own value and the messages to it, into belief. One that is not
     contested (node -1) hears nobody."""
     for s in range(len(belief)):
         belief[s] = value[s]
         if node >= 0:
             for d in range(message.shape[1]):
-                belief[s] += message[node, d, s]
+                belief[s] -= cost[d % len(cost)] / np.float32(255) * message[node, d, s]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -238,12 +239,13 @@ def _send(belief, message, node, back, together, own, other, cost, out):  # type
     """The message of a pixel (node) to another one, into out (n,), but for what that one said (back). together: States'
     bits of the two; own, other: how far apart bits of this pixel's and of the other's states are."""
     n = len(belief)
+    step = cost / np.float32(255)
     top = np.float32(-1e9)
     for s in range(n):
-        top = max(top, belief[s] - (message[node, back, s] if node >= 0 else np.float32(0)))
+        top = max(top, belief[s] + (step * message[node, back, s] if node >= 0 else np.float32(0)))
     for t in range(n):
         best = top - cost
         for s in range(n):
             if (together >> (s * own + t * other)) & 1:
-                best = max(best, belief[s] - (message[node, back, s] if node >= 0 else np.float32(0)))
-        out[t] = best - top
+                best = max(best, belief[s] + (step * message[node, back, s] if node >= 0 else np.float32(0)))
+        out[t] = np.uint8((top - best) / step + np.float32(0.5))

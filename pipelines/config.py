@@ -144,6 +144,45 @@ class OverlayOptions(Section):
     )
 
 
+class PeopleOptions(Section):
+    """Where people are, if somebody knows: masks, or a model. Without either, what moves is found by itself."""
+
+    masks: str | None = Field(
+        default=None,
+        description=(
+            "folder or pattern of pictures, one for each picture of the clip: white = people (or whatever else "
+            "moves), black = scene; left out of registration, and of the panorama where it can be; none = no masks"
+        ),
+    )
+    model: str | None = Field(
+        default=None,
+        description=(
+            "ONNX file of a person detector or segmenter that finds such masks; needs the extra [people] "
+            "(onnxruntime); none = no detector"
+        ),
+    )
+    person_class: int = Field(
+        default=0,
+        ge=0,
+        le=10000,
+        description="number of the class 'person': 0 in COCO's 80, 1 in torchvision's and COCO's 91, 15 in VOC",
+    )
+    least_score: float = Field(default=0.3, gt=0, lt=1, description="score from which a person is one")
+    input: Literal["rgb01", "bgr255", "imagenet"] = Field(
+        default="rgb01",
+        description=(
+            "what the model takes: RGB from 0 to 1, BGR from 0 to 255 (YOLOX), or RGB less ImageNet's mean, "
+            "over its deviation"
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.masks is not None and self.model is not None:
+            raise ValueError("people.masks and people.model exclude each other")
+        return self
+
+
 class RegistrationOptions(Section):
     """Direct alignment of two frames."""
 
@@ -381,6 +420,7 @@ class Config(Section):
 
     decode: DecodeOptions = DecodeOptions()
     overlays: OverlayOptions = OverlayOptions()
+    people: PeopleOptions = PeopleOptions()
     registration: RegistrationOptions = RegistrationOptions()
     calibration: CalibrationOptions = CalibrationOptions()
     shots: ShotOptions = ShotOptions()

@@ -32,7 +32,10 @@ NEEDED = (
     ("rich", "rich"),
     ("typer", "typer"),
 )
-OPTIONAL = (("pyarrow", "camera.parquet", "pip install 'broadcast-mosaic[parquet]'"),)
+OPTIONAL = (
+    ("pyarrow", "camera.parquet", "pip install 'broadcast-mosaic[parquet]'"),
+    ("onnxruntime", "people.model", "pip install 'broadcast-mosaic[people]'"),
+)
 # Decoders by what they are met as; the first of each that PyAV has is used.
 DECODERS = (
     ("h264", "most broadcast and web clips"),

@@ -52,22 +52,30 @@ class KeyframeImages:
         handle, name = tempfile.mkstemp(prefix="keyframes-", suffix=".raw", dir=folder)
         self._file, self._path = handle, Path(name)
         self._where: dict[int, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
+        self._scene: dict[int, tuple[NDArray[np.uint8], tuple[int, ...]]] = {}  # 4 KB each at 1080p
         self._end = 0
 
-    def put(self, frame: int, pyramid: Pyramid) -> None:
-        """Keep the smoothed full-size level of a frame."""
+    def put(self, frame: int, pyramid: Pyramid, scene: NDArray[np.uint8] | None = None) -> None:
+        """Keep the smoothed full-size level of a frame. scene: at a quarter of the size, 1 = without its people."""
         level = np.ascontiguousarray(pyramid.levels[0])
         os.pwrite(self._file, level.tobytes(), self._end)
         self._where[frame] = (self._end, level.shape, level.dtype)
         self._end += level.nbytes
+        if scene is not None:
+            self._scene[frame] = np.packbits(scene), scene.shape
 
     def pyramid(self, frame: int, n_levels: int, mask: NDArray[np.bool_] | None) -> Pyramid:
-        """The pyramid of a kept frame, under a mask that may be newer than the frame."""
+        """The pyramid of a kept frame, under a mask that may be newer than the frame, and without its people."""
         offset, shape, dtype = self._where[frame]
         raw = os.pread(self._file, int(np.prod(shape)) * dtype.itemsize, offset)
-        return build_pyramid(
+        pyramid = build_pyramid(
             np.frombuffer(raw, dtype).reshape(shape), n_levels=n_levels, smooth=False, mask=mask
         )
+        if frame not in self._scene:
+            return pyramid
+        bits, size = self._scene[frame]
+        scene = np.unpackbits(bits, count=int(np.prod(size))).reshape(size)
+        return replace(pyramid, mask=scene if pyramid.mask is None else np.minimum(scene, pyramid.mask))
 
     def close(self) -> None:
         """Remove the file. A second call does nothing: the descriptor's number may be another file's by then."""

@@ -21,6 +21,8 @@ from pipelines.keyframe_graph import distance_in_widths
 
 FLASH_LOG_GAIN = 0.25  # of a pair of neighbours or of a keyframe: more is a flash, or an exposure on its way
 FADING_SCORE = 0.5  # of a good link to the keyframe: the next one may be doubtful (score_ok is .6)
+# Of what a keyframe saw, share that is still to be seen: where people are masked, less than its distance says.
+FADING_OVERLAP = 0.5
 WEAK_CHAIN = 5  # frames without a direct link to the keyframe before a new keyframe is taken
 SAME_VIEW = 0.6  # of registration.keyframe_shift: as near as that a known keyframe does instead of a new one
 MAX_LINKS = 6  # earlier keyframes that a new one is registered to: nearest and farthest by predicted overlap
@@ -59,7 +61,8 @@ class KeyframePolicy:
         a crowd of players) waits for a better one, up to twice the distance; where a link to the keyframe will soon
         be doubtful, as players cover what it saw, the last good one is taken.
         """
-        if direct is not None and direct.status == PairStatus.OK and direct.score > FADING_SCORE:
+        fit = direct if direct is not None and direct.status == PairStatus.OK else None
+        if fit is not None and (fit.score > FADING_SCORE or fit.overlap < FADING_OVERLAP):
             return True
         moved_px, zoom = centre_motion(chain.H_frame_keyframe, self.size_px)
         share = min(1.0, n_keyframes / 3.0)

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.pyramid import Pyramid, build_pyramid
+from mosaic.pyramid import Pyramid, build_pyramid, quarter_mask
 from mosaic.rescue import small_gray
 from mosaic.template import SelectionOptions, Template, build_template
 from pipelines.errors import InputError
+from pipelines.overlays import both_masks
 
 SMALL_PX = 1280  # width below which a picture is small
 LARGE_PX = 1600  # and from which it is large
@@ -25,13 +26,14 @@ LEAST_SIDE_PX = 8  # two pixels at a quarter of the size, where graphics are loo
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedFrame:
     """A frame before registration. template: of the levels from `finest_of` on, for the frame after it; small: see
-    small_gray."""
+    small_gray; scene: at a quarter of the size, 1 = none of the people that are known (None: nothing is known)."""
 
     frame: int
     pts_s: float
     pyramid: Pyramid
     template: Template
     small: NDArray[np.uint8]
+    scene: NDArray[np.uint8] | None = None
 
     @property
     def coarse(self) -> NDArray[np.generic]:
@@ -69,9 +71,11 @@ def prepare_frame(
     selection: SelectionOptions,
     n_levels: int | None = None,
     mask: NDArray[np.bool_] | None = None,
+    scene: NDArray[np.bool_] | None = None,
 ) -> PreparedFrame:
-    """Pyramid, template and small picture of gray (h, w), uint8 or float32 0..255. mask (h, w): True = usable."""
-    pyramid = build_pyramid(gray, n_levels=n_levels, mask=mask)
+    """Pyramid, template and small picture of gray (h, w), uint8 or float32 0..255. mask (h, w): True = usable in all
+    frames; scene (h, w): True = no people in this one."""
+    pyramid = build_pyramid(gray, n_levels=n_levels, mask=both_masks(mask, scene))
     levels = tuple(range(finest_of(pyramid.size_px), len(pyramid.levels)))
     return PreparedFrame(
         frame=frame,
@@ -79,4 +83,5 @@ def prepare_frame(
         pyramid=pyramid,
         template=build_template(pyramid, frame, options=selection, levels=levels),
         small=small_gray(pyramid),
+        scene=None if scene is None else quarter_mask(scene),
     )

@@ -34,6 +34,7 @@ from pipelines.keyframe_graph import KeyframeImages
 from pipelines.merged_shots import merge_shots
 from pipelines.output_folder import OutputFolder, run_digest
 from pipelines.overlays import OverlayFinder, both_masks
+from pipelines.people import People, open_people
 from pipelines.preparation import PreparedFrame, prepare_frame, refuse_tiny
 from pipelines.records import CameraTable, RunRecord, ShotRecord
 from pipelines.report.build import write_report
@@ -72,6 +73,7 @@ class _Job:
     thumbnails: dict[int, bytes] = field(default_factory=dict)
     images: dict[int, KeyframeImages] = field(default_factory=dict)
     overlays: OverlayFinder | None = None
+    people: People | None = None
     mask: NDArray[np.bool_] | None = None
     n_levels: int = 4
     second: Iterator[Frame] | None = None
@@ -124,6 +126,7 @@ def process(
         )
         if config.overlays.enabled:
             job.overlays = OverlayFinder(opened.facts.size_px, config.overlays)
+        job.people = open_people(config.people, opened.facts.size_px, config.run.threads or 2)
         if config.shots.merge:
             job.shelf = ShotShelf(job.scratch)
         try:
@@ -195,11 +198,7 @@ def _first_pass(job: _Job) -> None:
             if frame is not None:
                 _note(job, frame)
                 own = splitter.screen_mask(frame.index - 2) if job.overlays is not None else None
-                prepared = frame, preparing.submit(
-                    prepare_frame, frame.index, frame.pts_s, frame.gray,
-                    selection=selection_of(config.registration), n_levels=job.n_levels,
-                    mask=both_masks(job.mask, own),
-                )  # fmt: skip
+                prepared = frame, preparing.submit(_prepared, job, frame, both_masks(job.mask, own))
             if ahead is not None:
                 count += 1
                 follow(*ahead)
@@ -212,6 +211,14 @@ def _first_pass(job: _Job) -> None:
         raise InputError(job.clip.facts.path, "no picture in the chosen range", "lower run.start_frame")
     for shot in splitter.finish():
         _finish(job, shot)
+
+
+def _prepared(job: _Job, frame: Frame, mask: NDArray[np.bool_] | None) -> PreparedFrame:
+    """A frame as registration wants it. mask (h, w): True = usable, as far as the screen is concerned."""
+    return prepare_frame(
+        frame.index, frame.pts_s, frame.gray, selection=selection_of(job.config.registration), n_levels=job.n_levels,
+        mask=mask, scene=None if job.people is None else job.people.scene(frame),
+    )  # fmt: skip
 
 
 def _note(job: _Job, frame: Frame) -> None:
@@ -258,6 +265,7 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
         solved = solve_shot(
             tracker, facts, index, job.second_frames, images=images, mask=mask, n_levels=job.n_levels,
             config=job.config, scratch=job.scratch, progress=job.progress, keep_frames=job.shelf is not None,
+            people=job.people,
         )  # fmt: skip
         with solved.timings.measure("write"):
             record = write_shot(job.folder, index, tracker, solved, job.config)
@@ -270,6 +278,8 @@ def _finish(job: _Job, tracked: TrackedShot) -> None:
         if job.shelf is not None and not solved.refused:
             own = [facts[o.frame] for o in tracker.observations]
             job.shelf.put(index, tracker, solved, own, images, mask, job.n_levels)
+    if job.people is not None:
+        job.people.forget(last)
     job.thumbnails |= thumbnails(tracker)
     if job.shelf is None or index not in job.shelf.indices:
         images.close()
@@ -307,6 +317,8 @@ def _record(job: _Job, clip: Clip) -> RunRecord:
     versions = {"broadcast-mosaic": program_version(), "python": platform.python_version()}
     versions |= {name: metadata.version(name) for name in PACKAGES}
     extra: dict[str, Any] = {"overlays": job.overlays.facts()} if job.overlays is not None else {}
+    if job.people is not None:
+        extra["people"] = job.people.facts()
     if job.merging:
         extra["merging"] = job.merging
     return RunRecord(

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.framestore import FrameStore
+from mosaic.moving import DISTRUSTED
 from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairFit
 from pipelines.decode import Frame
 from pipelines.moving import MovingFinder, Small
 from pipelines.overlays import both_masks
+from pipelines.people import People
 from pipelines.retracking import Retracker
 
 # Frames in work at once; each holds its gray, its pyramid and the decoder's picture (8 MB at 1080p).
@@ -35,6 +37,7 @@ def second_pass(
     planned: set[int],
     mask: NDArray[np.bool_] | None,
     stays: Callable[[int], NDArray[np.bool_] | None],
+    people: People | None,
     n_levels: int,
     threads: int,
     progress: Callable[[str, int, int | None], None],
@@ -43,6 +46,7 @@ def second_pass(
 
     frames: reaches the shot's frames in order, may start before them. mask: usable pixels of all of them.
     stays: of a frame, (h, w), False = on the screen there for a while: left out of registration (see MovingFinder).
+    people: where they are known, they are left out too, and distrusted in the pictures stored.
     """
     observations = retracker.tracker.observations
     first, last = observations[0].frame, observations[-1].frame
@@ -51,7 +55,10 @@ def second_pass(
     def register(frame: Frame) -> list[PairFit]:
         @cache  # most frames want none
         def pyramid() -> Pyramid:
-            return build_pyramid(frame.gray, n_levels=n_levels, mask=both_masks(mask, stays(frame.index)))
+            own = stays(frame.index)
+            if people is not None:
+                own = both_masks(own, people.scene(frame))
+            return build_pyramid(frame.gray, n_levels=n_levels, mask=both_masks(mask, own))
 
         return retracker.register(frame.index, pyramid)
 
@@ -67,7 +74,10 @@ def second_pass(
             if deep is None:
                 # Its source has more than 8 bits, and the panorama keeps them; images of a folder need not be alike.
                 deep = frame.gray.dtype != np.uint8
-            store.put(frame.index, frame.deep_picture(True) if deep else picture(), mask, small=reduced)
+            trust = (
+                None if people is None else np.where(people.scene(frame), 255, DISTRUSTED).astype(np.uint8)
+            )
+            store.put(frame.index, frame.deep_picture(True) if deep else picture(), mask, trust, reduced)
         return small
 
     def judge(index: int, kept: Future[Small | None]) -> None:

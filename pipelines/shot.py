@@ -28,6 +28,7 @@ from pipelines.links import contradicted_frames, without_doubtful
 from pipelines.moments import Trail
 from pipelines.moving import MovingFinder
 from pipelines.panorama import PanoramaPlan, compose, moments_of, plan_panorama
+from pipelines.people import People
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
 from pipelines.rotation_fit import LEAST_PIECE, RotationFit, largest_piece, refuse, rotation_fit
@@ -81,6 +82,7 @@ class _Job:
     config: Config
     scratch: Path
     progress: Callable[[str, int, int | None], None]
+    people: People | None
 
 
 def solve_shot(
@@ -96,16 +98,18 @@ def solve_shot(
     scratch: Path,
     progress: Callable[[str, int, int | None], None],
     keep_frames: bool = False,
+    people: People | None = None,
 ) -> CalibratedShot:
     """Second half of the job for one shot. keep_frames: leave the panorama's frames open; the caller closes them.
 
     facts: per frame number. frames: starts (or goes on with) a second decoding of the clip that will reach the shot's
-    frames. mask: usable pixels, as known at the shot's end. Raises only on mistakes; bad footage is a verdict.
+    frames. mask: usable pixels, as known at the shot's end. people: where somebody knows them. Raises only on mistakes;
+    bad footage is a verdict.
     """
     timings = Timings()
     job = _Job(
         tracker=tracker, facts=[facts[o.frame] for o in tracker.observations], shot=shot, mask=mask,
-        n_levels=n_levels, config=config, scratch=scratch, progress=progress,
+        n_levels=n_levels, config=config, scratch=scratch, progress=progress, people=people,
     )  # fmt: skip
     # A quarter of a run in which no frame goes by: without a line of its own the program would seem to hang.
     progress("calibration", 0, None)
@@ -242,7 +246,7 @@ def _registered_again(
         ),
         MovingFinder({p.frame: p for p in placed}, planned, store, tracker.screen_mask),
         store,
-        planned=planned, mask=job.mask, stays=tracker.screen_mask, n_levels=job.n_levels,
+        planned=planned, mask=job.mask, stays=tracker.screen_mask, people=job.people, n_levels=job.n_levels,
         threads=job.config.run.threads or 2, progress=job.progress,
     )  # fmt: skip
 

@@ -215,7 +215,7 @@ class ShotTracker:
         template = with_level(look.template, look.pyramid, 0, options=selection_of(self.options))
         self.keyframes[look.frame] = Keyframe(frame=look.frame, template=template, small=look.small)
         if self.images is not None:
-            self.images.put(look.frame, look.pyramid)
+            self.images.put(look.frame, look.pyramid, look.scene)
         self._current, self._chain = look.frame, Chain()
 
     def _observe(
