@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from mosaic.motion import expand_map
 from mosaic.surface import Placement, Surface
+from mosaic.views import MOMENT_FRAMES
 
 TILE_PX = 128
 STEP_PX = 8  # surface px between exact points of a map
 BORDER_PX = 2.0  # of a frame, not used
 SAME_GREY = 12  # colours that differ by less are one
-MOMENT_FRAMES = 6  # views nearer than this say the same about a place
 EVIDENCE_STEP = 1 / 20  # nats per grey level of the evidence plane, 128 = none
 
 Picture = NDArray[np.uint8]
