@@ -418,9 +418,10 @@ def plan_views(
     """Which frames a second pass over the clip has to keep. Cost and result are bounded by the panorama's area.
 
     placements: approximate ones will do, composite() looks again at the final ones. shown: what is known of where
-    bodies stand (glances.py). With it as many views are planned as suffice where all agree, and then frames that show
-    the ground where those hide it; without it K everywhere, and hope. No frames: none sees a point of the
-    surface within its margin (a panorama a few pixels high). Raises ValueError when there is no placement.
+    bodies stand (glances.py). With it as many views are planned as suffice where all agree, and then frames that
+    show the ground where those hide it, no more in all than K views everywhere would take. No frames: none sees a
+    point of the surface within its margin (a panorama a few pixels high). Raises ValueError when there is no
+    placement.
     """
     options = options or CompositeOptions()
     candidates = _thin([p for p in placements if np.isfinite(p.px_per_rad)], options.max_candidates)
@@ -428,13 +429,20 @@ def plan_views(
         raise ValueError("no placement to plan a panorama for")
     lattice = lattice_of(surface)
     rating = rate_views(candidates, lattice, options)
-    n_views = options.views if shown is None else min(options.views, CLEAR_VIEWS)
-    chosen, count, limit = select_views(rating, candidates, options, n_views=n_views, min_gap=options.min_gap)
-    if chosen:
-        chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
-    frames = {candidates[i].frame for i in chosen}
+
+    def chosen_for(n_views: int) -> tuple[set[int], NDArray[np.int32], int]:
+        chosen, count, limit = select_views(
+            rating, candidates, options, n_views=n_views, min_gap=options.min_gap
+        )
+        if chosen:
+            chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
+        return {candidates[i].frame for i in chosen}, count, limit
+
+    frames, count, limit = chosen_for(options.views)
     if frames and shown is not None:
-        frames.update(show_rest(shown, sorted(frames), n_views, limit // 2))
+        most, n_views = len(frames), min(options.views, CLEAR_VIEWS)
+        frames, count, _ = chosen_for(n_views)
+        frames.update(show_rest(shown, sorted(frames), n_views, most - len(frames)))
     return ViewPlan(
         frames=tuple(sorted(frames)),
         n_views=count.reshape(len(lattice.y_px), len(lattice.x_px)),
