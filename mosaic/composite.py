@@ -112,18 +112,12 @@ def composite(
         for k in plan.frames
         if k in store and k in by_frame and np.isfinite(by_frame[k].px_per_rad)
     ]
-    lattice = lattice_of(surface)
-    views, rating, vote = _final_views(stored, lattice, surface, options)
-    light = solve_light(store, views, surface) if options.gains else Light(np.ones((len(views), 3)), NONE)
-    scene = Scene(
-        surface=surface, store=store, views=views, gains=light.gains.astype(np.float32),
-        falloff=light.falloff, lattice=lattice, floor=rating.floor.reshape(vote.shape[1:]), vote=vote, options=options,
-        still=tuple(store.still(p.frame) for p in views),
-    )  # fmt: skip
+    scene, rating, light = scene_of(store, stored, surface, options)
+    views = scene.views
     if options.motion_rounds > 0:
         still, quiet = find_still(scene)
-        clear = shown_clear(still, views, lattice, surface)
-        vote = share_views(views, rating, lattice, surface.scale_px, options, clear)
+        clear = shown_clear(still, views, scene.lattice, surface)
+        vote = share_views(views, rating, scene.lattice, surface.scale_px, options, clear)
         scene = replace(scene, still=still, quiet=quiet, vote=vote)
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     layers = paint(replace(scene, deep=store.deep), canvas, progress)
@@ -137,6 +131,23 @@ def composite(
         frames=tuple(p.frame for p in views), placements=by_frame, gains=light.gains, falloff=light.falloff,
         deep=layers.deep, canvas=canvas,
     )  # fmt: skip
+
+
+def scene_of(
+    store: FrameStore, stored: Sequence[Placement], surface: Surface, options: CompositeOptions
+) -> tuple[Scene, Rating, Light]:
+    """What find_still and paint work on: the views of these frames of a store, their votes and their light.
+
+    Raises ValueError when none of them sees the surface."""
+    lattice = lattice_of(surface)
+    views, rating, vote = _final_views(stored, lattice, surface, options)
+    light = solve_light(store, views, surface) if options.gains else Light(np.ones((len(views), 3)), NONE)
+    scene = Scene(
+        surface=surface, store=store, views=views, gains=light.gains.astype(np.float32),
+        falloff=light.falloff, lattice=lattice, floor=rating.floor.reshape(vote.shape[1:]), vote=vote, options=options,
+        still=tuple(store.still(p.frame) for p in views),
+    )  # fmt: skip
+    return scene, rating, light
 
 
 def _final_views(

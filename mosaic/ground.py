@@ -64,11 +64,13 @@ def decide(
     contested: NDArray[np.bool_],
     surface: Surface,
     threads: int,
+    *,
+    together: bool = True,
 ) -> tuple[Picture, NDArray[np.int16]]:
     """The composite (h, w, 3) with the ground decided where it is contested (h, w); and at how many moments that colour
     was seen there (h, w), 0 where nothing was decided.
 
-    witnesses: in the order of time. surface: the one whose pixels the composite has."""
+    witnesses: in the order of time. surface: the one whose pixels the composite has. together: see CompositeOptions."""
     height, width = contested.shape
     states = no_states(height, width)
     corners = [(x, y) for y in range(0, height, TILE_PX) for x in range(0, width, TILE_PX)]
@@ -96,7 +98,7 @@ def decide(
     with ThreadPoolExecutor(threads) as pool:
         for _ in pool.map(work, corners):
             pass
-    chosen = settle(states, contested)
+    chosen = settle(states, contested) if together else np.zeros((height, width), np.uint8)
     return states.picture(chosen, composite, contested)
 
 

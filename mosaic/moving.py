@@ -96,7 +96,10 @@ def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.
             moving = np.sum(list(pool.map(partial(_bodies, ground=ground), views)), axis=0)
             look = learn(ground.image, layers.n_seen > 0, ground.sure > 0, moving)
             witnesses = list(pool.map(partial(_witness, look=look), views))
-            image, moments = decide(witnesses, layers.image, contested, small.surface, scene.options.threads)
+            image, moments = decide(
+                witnesses, layers.image, contested, small.surface, scene.options.threads,
+                together=scene.options.together,
+            )  # fmt: skip
             known = np.where(contested, moments > 1, sure)
             ground = replace(ground, image=image, sure=known.astype(np.uint8))
         before = scene.still or (None,) * len(views)

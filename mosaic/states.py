@@ -14,9 +14,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mosaic.views import MOMENT_FRAMES
+
 N_STATES = 4  # the likeliest ones of a pixel; N_STATES ** 2 bits have room in 16
 SAME_GREY = 12  # colours that differ by less are one
-MOMENT_FRAMES = 6  # views nearer than this say the same about a place
 EVIDENCE_STEP = 1 / 20  # nats per grey level of the evidence plane, 128 = none
 # Pairs of pixels (down, right; px of a picture about 320 wide) that are asked whether a frame shows their states
 # together, and what it costs, in nats, if none does: next to each other that is a seam; letters of one text and parts

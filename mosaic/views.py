@@ -21,7 +21,14 @@ from mosaic.surface import Placement, Surface
 COVER_CELLS = 600  # over the longer side of the surface: how finely coverage is looked at
 SEAM_CELLS = 4  # of these at once, of frames that lie across a seam
 STRIP_VIEWS = (2, 7)  # least and most of a strip: two that disagree say so at least, a median of 7 is robust
+# Views of a place where it is known who shows it clear, and moments at which it is wanted clear: a median of 7 is
+# robust, and 7 views are within .05 dB of 25 where all agree.
+CLEAR_VIEWS = 7
 LEAST_CLEAR = 0.1  # a view that shows less of the ground about a point is of no use there
+# Share of a picture below which it is not stored for the ground that it alone shows: a player in a wide shot, 25 x 60
+# of 1280 x 720 px.
+BODY_SHARE = 1 / 600
+MOMENT_FRAMES = 6  # views nearer than this say the same about a place
 LEAST_RATIO = 0.08  # of the resolution floor: a view coarser than this does not even vote
 
 
@@ -40,6 +47,7 @@ class CompositeOptions:
     threads: tiles worked on at once. memory_bytes: an image larger than this lives in a file in the scratch folder.
     gains: level the exposure of the views and the lens's falloff. motion_rounds: rounds of learning
     what bodies look like and of deciding what the ground is (moving.py): the third and fourth change .1 dB; 0 = none.
+    together: decide for all pixels at once what is seen side by side (states.py), not for each by itself.
     quiet_views: views sampled where all agree about what they show (moving.py): 7 to 25 differ by .05 dB there, and
     half of the time goes into sampling.
     max_candidates: frames looked at when planning; a longer clip is thinned, the least blurred of each group stays.
@@ -65,6 +73,7 @@ class CompositeOptions:
     max_candidates: int = 1200
     gains: bool = True
     motion_rounds: int = 2
+    together: bool = True
     quiet_views: int = 9
 
     def __post_init__(self) -> None:
@@ -85,6 +94,18 @@ class Lattice:
     x_px: NDArray[np.float64]
     y_px: NDArray[np.float64]
     rays: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShownGround:
+    """Where some frames of a shot show the ground. frames (n,), ascending; clear (n, p): of each the cells of the
+    surface, all of one size, where nobody stands before it. vote (n,), 0..1: how much a frame's resolution lets it
+    count. cells_seen: that a frame covers, whoever stands there."""
+
+    frames: NDArray[np.int64]
+    clear: NDArray[np.bool_]
+    vote: NDArray[np.float32]
+    cells_seen: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -263,11 +284,16 @@ def rate_views(placements: Sequence[Placement], lattice: Lattice, options: Compo
 
 
 def select_views(
-    rating: Rating, placements: Sequence[Placement], options: CompositeOptions, *, min_gap: float = 0.0
+    rating: Rating,
+    placements: Sequence[Placement],
+    options: CompositeOptions,
+    *,
+    n_views: int,
+    min_gap: float = 0.0,
 ) -> tuple[list[int], NDArray[np.int32], int]:
     """Indices of the placements to use, the views per lattice point, and the most that the area allows.
 
-    First a third of K views from short moments of closer zoom, for detail that no other frame has; then K views far
+    First a third of K views from short moments of closer zoom, for detail that no other frame has; then n_views far
     apart in time, which say what stands still.
     """
     limit = frame_limit(rating.quality, options)
@@ -275,7 +301,7 @@ def select_views(
     rare = np.where(rating.rare, rating.quality, np.float32(0))
     sharp, _ = choose_frames(rare, time, -(-options.views // 3), limit, min_gap=min_gap)
     chosen, count = choose_frames(
-        rating.quality, time, options.views, limit, min_gap=min_gap, start=sharp,
+        rating.quality, time, n_views, limit, min_gap=min_gap, start=sharp,
         strip=options.strip, strip_gap=options.strip_gap,
     )  # fmt: skip
     return chosen, count, limit
@@ -386,12 +412,18 @@ def _inside_px(xy: NDArray[np.float64], size_px: tuple[int, int]) -> NDArray[np.
 
 
 def plan_views(
-    placements: Sequence[Placement], surface: Surface, options: CompositeOptions | None = None
+    placements: Sequence[Placement],
+    surface: Surface,
+    options: CompositeOptions | None = None,
+    shown: ShownGround | None = None,
 ) -> ViewPlan:
     """Which frames a second pass over the clip has to keep. Cost and result are bounded by the panorama's area.
 
-    placements: approximate ones will do, composite() looks again at the final ones. No frames: none sees a point of the
-    surface within its margin (a panorama a few pixels high). Raises ValueError when there is no placement.
+    placements: approximate ones will do, composite() looks again at the final ones. shown: what is known of where
+    bodies stand (glances.py). With it as many views are planned as suffice where all agree, and then frames that
+    show the ground where those hide it, no more in all than K views everywhere would take. No frames: none sees a
+    point of the surface within its margin (a panorama a few pixels high). Raises ValueError when there is no
+    placement.
     """
     options = options or CompositeOptions()
     candidates = _thin([p for p in placements if np.isfinite(p.px_per_rad)], options.max_candidates)
@@ -399,15 +431,73 @@ def plan_views(
         raise ValueError("no placement to plan a panorama for")
     lattice = lattice_of(surface)
     rating = rate_views(candidates, lattice, options)
-    chosen, count, limit = select_views(rating, candidates, options, min_gap=options.min_gap)
-    if chosen:
-        chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
+
+    def chosen_for(n_views: int) -> tuple[set[int], NDArray[np.int32], int]:
+        chosen, count, limit = select_views(
+            rating, candidates, options, n_views=n_views, min_gap=options.min_gap
+        )
+        if chosen:
+            chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
+        return {candidates[i].frame for i in chosen}, count, limit
+
+    frames, count, limit = chosen_for(options.views)
+    if frames and shown is not None:
+        most, n_views = len(frames), min(options.views, CLEAR_VIEWS)
+        frames, count, _ = chosen_for(n_views)
+        frames.update(show_rest(shown, sorted(frames), n_views, most - len(frames)))
     return ViewPlan(
-        frames=tuple(sorted(candidates[i].frame for i in chosen)),
+        frames=tuple(sorted(frames)),
         n_views=count.reshape(len(lattice.y_px), len(lattice.x_px)),
         n_candidates=len(candidates),
         limit=limit,
     )
+
+
+def show_rest(shown: ShownGround, chosen: Sequence[int], n_views: int, limit: int) -> list[int]:
+    """Further frames of `shown`, `limit` at most, so that every cell is seen clear at n_views moments, or at as many as
+    there are.
+
+    chosen: frames that are stored anyway, ascending; each is taken to show what the nearest in time of `shown` does.
+    The first moment tells most: a cell counts by one over the moments that it has. Ends where no frame is worth a body.
+    """
+    if not len(shown.frames):
+        return []
+    rows = sorted({int(np.argmin(np.abs(shown.frames - frame))) for frame in chosen})
+    wanted = np.minimum(n_views, _n_moments_clear(shown.frames, shown.clear))
+    wanting = np.flatnonzero(_n_moments_clear(shown.frames[rows], shown.clear[rows]) < wanted)
+    clear, wanted = shown.clear[:, wanting], wanted[wanting]  # the others need not be looked at again
+    have = np.zeros(len(wanting), np.int32)
+    new = (
+        shown.vote[:, None] * clear
+    )  # what each would add: nothing where a view of the same moment is clear as well
+
+    def take(row: int) -> None:
+        have[new[row] > 0] += 1
+        same = np.abs(shown.frames - shown.frames[row]) < MOMENT_FRAMES
+        new[same] *= ~clear[row]
+
+    for row in rows:
+        take(row)
+    added: list[int] = []
+    while len(added) < limit:
+        gain = new @ np.where(have < wanted, 1 / (1 + have), 0).astype(np.float32)
+        best = int(np.argmax(gain))
+        if gain[best] < BODY_SHARE * shown.cells_seen:
+            break
+        take(best)
+        added.append(int(shown.frames[best]))
+    return added
+
+
+def _n_moments_clear(frames: NDArray[np.int64], clear: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """At how many moments each column of clear (n, p) is set; frames (n,), ascending."""
+    count = np.zeros(clear.shape[1], np.int32)
+    last = np.full(clear.shape[1], -(10**9), np.int64)
+    for frame, here in zip(frames, clear, strict=True):
+        new = here & (frame - last >= MOMENT_FRAMES)
+        count += new
+        last[new] = frame
+    return count
 
 
 def _cover_rest(

@@ -13,8 +13,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +32,8 @@ from pipelines.bridge import CameraPose, Rolling, RotationZoomFamily, homography
 
 log = logging.getLogger(__name__)
 
+# Width of glances, and frames between them: in .16 s a runner has gone half his width. 15 KB of disk each.
+GLANCE_PX, GLANCE_EVERY = 160, 4
 NEAREST, FARTHEST = (
     4,
     8,
@@ -46,13 +49,16 @@ class KeyframePictures(Protocol):
 
 
 class KeyframeImages:
-    """Gray pictures of keyframes on disk, so that a long shot does not fill the memory. Closed with the shot."""
+    """Gray pictures of keyframes on disk, so that a long shot does not fill the memory, and small ones of frames in
+    between: glances. Closed with the shot."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         handle, name = tempfile.mkstemp(prefix="keyframes-", suffix=".raw", dir=folder)
         self._file, self._path = handle, Path(name)
         self._where: dict[int, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
         self._scene: dict[int, tuple[NDArray[np.uint8], tuple[int, ...]]] = {}  # 4 KB each at 1080p
+        self._glances: dict[int, int] = {}  # frame -> where its small picture lies
+        self._glance_size = (0, 0)
         self._end = 0
 
     def put(self, frame: int, pyramid: Pyramid, scene: NDArray[np.uint8] | None = None) -> None:
@@ -76,6 +82,30 @@ class KeyframeImages:
         bits, size = self._scene[frame]
         scene = np.unpackbits(bits, count=int(np.prod(size))).reshape(size)
         return replace(pyramid, mask=scene if pyramid.mask is None else np.minimum(scene, pyramid.mask))
+
+    def put_glance(self, frame: int, pyramid: Pyramid) -> None:
+        """Keep a small picture of a frame, unless one of the GLANCE_EVERY frames before has one. Frames in order."""
+        if frame - next(reversed(self._glances), -GLANCE_EVERY) < GLANCE_EVERY:
+            return
+        width, height = pyramid.size_px
+        self._glance_size = (min(width, GLANCE_PX), max(1, round(height * min(width, GLANCE_PX) / width)))
+        level = [p for p in pyramid.levels if p.shape[1] >= self._glance_size[0]][-1]
+        small = cv2.resize(cast(Any, level), self._glance_size, interpolation=cv2.INTER_AREA)
+        eight = np.ascontiguousarray(np.clip(np.rint(small), 0, 255), np.uint8)
+        os.pwrite(self._file, eight.tobytes(), self._end)
+        self._glances[frame] = self._end
+        self._end += eight.nbytes
+
+    @property
+    def glances(self) -> tuple[int, ...]:
+        """Frames of which there is a small picture, ascending."""
+        return tuple(self._glances)
+
+    def glance(self, frame: int) -> NDArray[np.uint8]:
+        """The small picture (h, w) of a frame, GLANCE_PX wide or less. Raises KeyError for a frame without one."""
+        width, height = self._glance_size
+        raw = os.pread(self._file, width * height, self._glances[frame])
+        return np.frombuffer(raw, np.uint8).reshape(height, width)
 
     def close(self) -> None:
         """Remove the file. A second call does nothing: the descriptor's number may be another file's by then."""

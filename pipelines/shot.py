@@ -27,7 +27,8 @@ from pipelines.keyframe_graph import KeyframeImages, KeyframeResult
 from pipelines.links import contradicted_frames, without_doubtful
 from pipelines.moments import Trail
 from pipelines.moving import MovingFinder
-from pipelines.panorama import PanoramaPlan, compose, moments_of, plan_panorama
+from pipelines.overlays import both_masks
+from pipelines.panorama import PanoramaPlan, compose, glances_of, moments_of, plan_panorama
 from pipelines.people import People
 from pipelines.records import CameraTable
 from pipelines.retracking import Retracker
@@ -186,7 +187,7 @@ def _with_panorama(
     world = head.R_head_world if head.observable else np.eye(3)
     with timings.measure("plan"):
         placements = placements_of(first.solution, world, tracker.observations, tracker.size_px, keyframes)
-        plan = plan_panorama([p for p in placements if p.frame in piece], job.config)
+        plan = _planned(job, [p for p in placements if p.frame in piece])
     if not plan.views.frames:
         size = f"{plan.surface.width} x {plan.surface.height}"
         full = frame_poses(tracker, keyframes, tracker.fits, start=first.solution)
@@ -226,6 +227,23 @@ def _with_panorama(
         no_panorama="" if panorama is not None else "no frame fits its camera", fits=tuple(fits),
         steps=tuple(steps), store=store if kept else None, explained=explained, trail=players, film=film,
     )  # fmt: skip
+
+
+def _planned(job: _Job, placements: Sequence[CameraPlacement]) -> PanoramaPlan:
+    """The panorama of these placements, by what the first pass' small pictures show."""
+    images, tracker = job.tracker.images, job.tracker
+    if images is None:
+        return plan_panorama(placements, job.config)
+
+    def mask(frame: int) -> NDArray[np.bool_] | None:
+        return both_masks(job.mask, tracker.screen_mask(frame))
+
+    glances = glances_of(images, {p.frame for p in placements}, mask, job.scratch)
+    try:
+        return plan_panorama(placements, job.config, glances=glances)
+    finally:
+        if glances is not None:
+            glances.close()
 
 
 def _registered_again(

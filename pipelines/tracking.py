@@ -130,6 +130,8 @@ class ShotTracker:
             step.H_dst_src if step is not None else self._chain.H_since(before), self.size_px
         )
         self._observe(look, "ok", "", moved_px, estimate)
+        if self.images is not None:
+            self.images.put_glance(look.frame, look.pyramid)
         if step is not None:
             self._screen.look(previous.template, look.pyramid, step, self.register_options.kernel)
         self._previous = look
