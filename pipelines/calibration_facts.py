@@ -9,6 +9,7 @@ import numpy as np
 from pipelines.pupil_facts import pupil_facts
 from pipelines.readout import readout_facts
 from pipelines.shot import CalibratedShot
+from pipelines.shutter import shutter_facts
 from pipelines.tracking import ShotTracker
 
 
@@ -50,6 +51,7 @@ def calibration_facts(shot: CalibratedShot, tracker: ShotTracker) -> dict[str, A
         },
         "pupil": pupil_facts(shot.keyframes.pupil, head.R_head_world if head.observable else np.eye(3)),
         "rolling_shutter": readout_facts(shot.keyframes.readout),
+        "shutter": shutter_facts(shot.keyframes.shutter),
         "keyframes": [int(k) for k in sorted(tracker.keyframes)],
         "keyframe_pairs": len(shot.keyframes.fits),
         "keyframe_pairs_usable": sum(f.usable for f in shot.keyframes.fits),

@@ -14,6 +14,7 @@ from mosaic.records import PairFit
 from pipelines.bridge import CameraPlacement, CameraPose, homography_graph, rolling_of
 from pipelines.keyframe_graph import KeyframeResult
 from pipelines.readout import without_readout
+from pipelines.shutter import USUAL
 from pipelines.tracking import Observation, ShotTracker
 
 
@@ -100,22 +101,23 @@ def placements_of(
     size_px: tuple[int, int],
     keyframes: KeyframeResult,
 ) -> list[CameraPlacement]:
-    """Placements of all solved frames, in the panorama's axes; half a frame's motion counts as blur.
+    """Placements of all solved frames, in the panorama's axes; a frame's motion while the shutter is open is blur.
 
-    keyframes: the pupil and the rolling shutter that were found with them belong to every frame.
+    keyframes: the pupil and the shutter, open and rolling, that were found with them belong to every frame.
     """
     parallax = keyframes.parallax
     turned = None if parallax is None else parallax.of_axes(R_surface_world)
     motion = {o.frame: o.motion_px for o in observations}
     rolling = rolling_of(keyframes.readout_share, solution)
     rates = {} if rolling is None else rolling.rates
+    open_share = USUAL if keyframes.shutter is None else keyframes.shutter.share
     return [
         CameraPlacement(
             frame=int(frame),
             size_px=size_px,
             lens=solution.lens,
             pose=CameraPose(log_f=float(log_f), R=R @ R_surface_world.T),
-            blur_px=float(np.nan_to_num(motion.get(int(frame), 0.0), nan=0.0)) * 0.5,
+            blur_px=float(np.nan_to_num(motion.get(int(frame), 0.0), nan=0.0)) * open_share,
             parallax=turned,
             share=0.0 if rolling is None else rolling.share,
             rate=rates.get(int(frame)),

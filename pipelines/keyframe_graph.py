@@ -29,6 +29,7 @@ from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairFit
 from mosaic.template import Template, prepare
 from pipelines.bridge import CameraPose, Rolling, RotationZoomFamily, homography_graph, pair_state
+from pipelines.shutter import Shutter
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +136,7 @@ class KeyframeResult:
     """The refined keyframes with the graph and options they were refined with, its fits, and the rounds it took.
 
     pupil, readout: what was found of a pupil's parallax and of a rolling shutter, which are then out of solution and
-    graph (not out of the fits)."""
+    graph (not out of the fits). shutter: how long it is open, where that shows."""
 
     solution: Solution
     graph: HomographyGraph
@@ -144,6 +145,7 @@ class KeyframeResult:
     options: RefineOptions
     pupil: PupilFit | None = None
     readout: RollingShutter | None = None
+    shutter: Shutter | None = None
 
     @property
     def readout_share(self) -> float | None:

@@ -15,7 +15,7 @@ from calib.records import KnownFocal, Priors, Solution
 from calib.refine import RefineOptions, refine
 from mosaic.records import PairFit
 from pipelines.bridge import Rolling
-from pipelines.camera_track import frame_poses
+from pipelines.camera_track import frame_poses, frame_steps
 from pipelines.config import Config
 from pipelines.keyframe_graph import (
     KeyframeImages,
@@ -26,6 +26,7 @@ from pipelines.keyframe_graph import (
 )
 from pipelines.pupil import with_pupil
 from pipelines.readout import with_readout
+from pipelines.shutter import find_shutter
 from pipelines.tracking import ShotTracker
 from pipelines.verified_part import part_to_solve_alone
 
@@ -81,6 +82,10 @@ def solve_keyframes(
         return tracks[-1]
 
     result = with_readout(result, tracker.fits, register, track)
+    shutter = find_shutter(
+        result.fits, frame_steps(tracker), images, tracker.size_px, n_levels=n_levels, mask=mask
+    )
+    result = replace(result, shutter=shutter)
     scaled = _with_known_focal(result, tracker, config)
     if scaled is not result:  # other focals, other turns
         return scaled, None
