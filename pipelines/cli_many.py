@@ -12,7 +12,7 @@ from pipelines.cli_results import print_json
 from pipelines.cli_runs import RunResult, exit_code
 from pipelines.clip_summary import row, write_summary
 from pipelines.config import Config
-from pipelines.errors import InputError, OutputError, UserError
+from pipelines.errors import ConfigError, InputError, OutputError, UserError
 from pipelines.many import SUMMARY, Outcome, Task, folder_names, read_list, run_many, work_on
 from pipelines.output_folder import held_folder
 from pipelines.progress import TerminalProgress
@@ -40,6 +40,9 @@ def run_clips(
     clips = [*named, *(read_list(listed) if listed is not None else ())]
     if STDIN in clips:
         raise InputError(STDIN, "standard input can only be the one clip of a run", "name files")
+    if config.people.masks is not None and len(clips) > 1:
+        cure = "run each clip with its own, or give a detector: people.model"
+        raise ConfigError("people.masks", f"belong to one clip, and {len(clips)} are named", cure)
     tasks = [
         Task(
             clip=clip, out=out / name, config=config, resume=resume or config.run.resume, quiet=quiet, verbose=verbose

@@ -102,6 +102,14 @@ def test_too_few_masks_end_the_run_in_one_line_and_leave_nothing(tmp_path, capsy
     assert not (out / "run.json").exists()
 
 
+def test_masks_of_one_clip_are_not_taken_for_several(tmp_path, capsys):
+    write_masks(tmp_path / "m", 5)
+    clips = ["assets/sample.mp4", "assets/other.mp4"]
+    assert main(["run", *clips, "-o", str(tmp_path / "out"), "--people.masks", str(tmp_path / "m")]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "belong to one clip, and 2 are named" in said and "\n" not in said
+
+
 @pytest.fixture(scope="module")
 def crowded(tmp_path_factory):
     """A clip with players over 40 % of the picture and hoardings that scroll, and its true masks."""
