@@ -467,9 +467,8 @@ def show_rest(shown: ShownGround, chosen: Sequence[int], n_views: int, limit: in
     wanting = np.flatnonzero(_n_moments_clear(shown.frames[rows], shown.clear[rows]) < wanted)
     clear, wanted = shown.clear[:, wanting], wanted[wanting]  # the others need not be looked at again
     have = np.zeros(len(wanting), np.int32)
-    new = (
-        shown.vote[:, None] * clear
-    )  # what each would add: nothing where a view of the same moment is clear as well
+    # What each would add: nothing where a view of the same moment is clear as well.
+    new = shown.vote[:, None] * clear
 
     def take(row: int) -> None:
         have[new[row] > 0] += 1
