@@ -205,7 +205,8 @@ def ideal_homographies(packed: Packed, k1_half: Array, pp_px: Array, aspect: flo
     return np.where(np.isfinite(H).all((-1, -2), keepdims=True), H, own)
 
 
-def _weighted_median(values: Array, weights: Array) -> float:
+def weighted_median(values: Array, weights: Array) -> float:
+    """The least of the values (n,) up to which half of the weights (n,) lie."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
@@ -237,7 +238,7 @@ def root_focals(packed: Packed, tree: list[TreeEdge], root: int, H_centred: Arra
         for s in range(S):
             use = valid[s] & np.isfinite(estimate[s]) & (angle[s] > 1e-6)
             if use.any():
-                out[s] = _weighted_median(estimate[s][use], angle[s][use] ** 4)
+                out[s] = weighted_median(estimate[s][use], angle[s][use] ** 4)
         log_root = np.where(np.isfinite(out), np.clip(out, np.log(0.2), np.log(30)), log_root)
     return out, valid.sum(1) / max(1, usable.sum())
 

@@ -18,7 +18,7 @@ from mosaic.framestore import FrameStore
 from mosaic.motion import expand_map
 from mosaic.moving import NEAR, find_still
 from mosaic.surface import Placement, Surface
-from mosaic.views import COVER_CELLS, LEAST_RATIO, CompositeOptions, ShownGround, resolution
+from mosaic.views import COVER_CELLS, CompositeOptions, ShownGround, clipped_ratio, resolution
 
 STEP_CELLS = 8  # between exact points of a map
 CELL_PX = 2.0  # least side of a cell, px of the small pictures
@@ -68,12 +68,7 @@ def shown_ground(
     ]
     if not views:
         return None
-    shrink = views[0].full.size_px[0] / store.size_px[0]
-    small = Surface(
-        kind=surface.kind, scale_px=surface.scale_px / shrink, cx=(surface.cx + 0.5) / shrink - 0.5,
-        cy=(surface.cy + 0.5) / shrink - 0.5, width=int(np.ceil(surface.width / shrink)),
-        height=int(np.ceil(surface.height / shrink)),
-    )  # fmt: skip
+    small = surface.reduced(views[0].full.size_px[0] / store.size_px[0])
     try:
         # Each pixel by itself: one round has not learned enough of how bodies look to call a whole one ground, and a
         # body of which a part is found is closed.
@@ -106,6 +101,5 @@ def shown_ground(
 def _votes(views: Sequence[Placement]) -> NDArray[np.float32]:
     """As share_views has it for coarser views: the root of the resolution over what is usual in the shot; 0 where it is
     so coarse that it would not vote."""
-    fineness = np.array([resolution(v) for v in views])
-    ratio = np.minimum(fineness / np.median(fineness), 1.0)
-    return np.where(ratio < LEAST_RATIO, 0.0, np.sqrt(ratio)).astype(np.float32)
+    usual = np.median([resolution(v) for v in views])
+    return np.sqrt(clipped_ratio(views, np.array([usual])))[:, 0].astype(np.float32)

@@ -180,19 +180,18 @@ def _quiet(layers: Layers, options: CompositeOptions, shrink: int) -> NDArray[np
 
 def _small_scene(scene: Scene, shrink: int) -> Scene:
     """The same scene on a surface whose pixels are `shrink` times larger."""
-    full = scene.surface
-    surface = Surface(
-        kind=full.kind, scale_px=full.scale_px / shrink, cx=(full.cx + 0.5) / shrink - 0.5,
-        cy=(full.cy + 0.5) / shrink - 0.5, width=-(-full.width // shrink), height=-(-full.height // shrink),
-    )  # fmt: skip
     lattice = Lattice(
         x_px=scene.lattice.x_px / shrink, y_px=scene.lattice.y_px / shrink, rays=scene.lattice.rays
     )
     # The maps need not be finer than the comparison.
+    options = replace(scene.options, tile_px=256, cubic=False)
     return replace(
-        scene, surface=surface, lattice=lattice, options=replace(scene.options, tile_px=256, cubic=False),
+        scene,
+        surface=scene.surface.reduced(shrink),
+        lattice=lattice,
+        options=options,
         map_error_px=0.1 * shrink,
-    )  # fmt: skip
+    )
 
 
 def _levelled(

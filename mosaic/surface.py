@@ -80,6 +80,14 @@ class Surface:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"surface size {self.width} x {self.height} is empty")
 
+    def reduced(self, shrink: float) -> Surface:
+        """The same surface in pixels `shrink` times larger; the last ones may reach beyond it."""
+        return Surface(
+            kind=self.kind, scale_px=self.scale_px / shrink, cx=(self.cx + 0.5) / shrink - 0.5,
+            cy=(self.cy + 0.5) / shrink - 0.5, width=int(np.ceil(self.width / shrink)),
+            height=int(np.ceil(self.height / shrink)),
+        )  # fmt: skip
+
     @property
     def centre_lon_rad(self) -> float:
         """Longitude of the crop's middle: longitudes are taken within half a turn of it (0 on a plane, and on Pannini's

@@ -335,7 +335,7 @@ def share_views(
     near = np.where((rating.quality == 0) & fine & (reach < 0), np.maximum(1 + reach / cell, 0.0), 0.0)
     shape = (len(placements), ny, nx)
     coarse = np.where(
-        (reach > options.margin_px) & ~fine, np.sqrt(_clipped_ratio(placements, rating.floor)), 0.0
+        (reach > options.margin_px) & ~fine, np.sqrt(clipped_ratio(placements, rating.floor)), 0.0
     )
     quality, rare, near = rating.quality.reshape(shape), rating.rare.reshape(shape), near.reshape(shape)
     coarse = coarse.reshape(shape)
@@ -363,7 +363,7 @@ def share_views(
     return _independence(taken.reshape(len(placements), -1), time, options.min_span).reshape(shape)
 
 
-def _clipped_ratio(placements: Sequence[Placement], floor: NDArray[np.float64]) -> NDArray[np.float64]:
+def clipped_ratio(placements: Sequence[Placement], floor: NDArray[np.float64]) -> NDArray[np.float64]:
     """Resolution of each frame over the floor at each point (n, p), at most 1; 0 below LEAST_RATIO."""
     fineness = np.array([resolution(p) for p in placements])[:, None]
     ratio = np.minimum(fineness / np.maximum(floor, 1e-9), 1.0)

@@ -53,7 +53,9 @@ class KeyframeImages:
     """Gray pictures of keyframes on disk, so that a long shot does not fill the memory, and small ones of frames in
     between: glances. Closed with the shot."""
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: str | os.PathLike[str], *, glances: bool = True) -> None:
+        """folder: where the scratch file is made. glances: keep them; without a panorama nobody looks at them."""
+        self._wants_glances = glances
         handle, name = tempfile.mkstemp(prefix="keyframes-", suffix=".raw", dir=folder)
         self._file, self._path = handle, Path(name)
         self._where: dict[int, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
@@ -86,7 +88,7 @@ class KeyframeImages:
 
     def put_glance(self, frame: int, pyramid: Pyramid) -> None:
         """Keep a small picture of a frame, unless one of the GLANCE_EVERY frames before has one. Frames in order."""
-        if frame - next(reversed(self._glances), -GLANCE_EVERY) < GLANCE_EVERY:
+        if not self._wants_glances or frame - next(reversed(self._glances), -GLANCE_EVERY) < GLANCE_EVERY:
             return
         width, height = pyramid.size_px
         self._glance_size = (min(width, GLANCE_PX), max(1, round(height * min(width, GLANCE_PX) / width)))

@@ -164,7 +164,7 @@ def _first_pass(job: _Job) -> None:
     def new_tracker() -> ShotTracker:
         priors = priors_of(config, job.clip.facts.pixel_aspect)
         tracker = ShotTracker(size_px, config.registration, priors, register_options=register)
-        tracker.images = KeyframeImages(job.scratch)
+        tracker.images = KeyframeImages(job.scratch, glances=config.panorama.enabled)
         job.images[id(tracker)] = tracker.images
         return tracker
 

@@ -10,16 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.linear import weighted_median
 from mosaic.blur import spread_difference
 from mosaic.coords import transfer
 from mosaic.pyramid import Pyramid
 from mosaic.records import PairFit
 from pipelines.chain import centre_motion
+
+if TYPE_CHECKING:
+    from pipelines.keyframe_graph import KeyframePictures  # which holds a Shutter itself
 
 MOST_PAIRS = 40  # looked at: those that tell most
 # Of difference, were the shutter always open. A difference is found to about 2 px^2 (mosaic/blur.py).
@@ -31,14 +35,6 @@ LARGEST_STD = 0.15  # of a share's square, beyond which nothing is said
 USUAL = 0.29
 
 FloatArray = NDArray[np.float64]
-
-
-class Pictures(Protocol):
-    """Pictures of keyframes, as keyframe_graph.KeyframePictures has them."""
-
-    def pyramid(self, frame: int, n_levels: int, mask: NDArray[np.bool_] | None) -> Pyramid:
-        """Of a frame, under a mask (h, w)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +49,7 @@ class Shutter:
 def find_shutter(
     pairs: Iterable[PairFit],
     steps: Iterable[PairFit],
-    pictures: Pictures,
+    pictures: KeyframePictures,
     size_px: tuple[int, int],
     n_levels: int,
     mask: NDArray[np.bool_] | None,
@@ -84,10 +80,8 @@ def find_shutter(
             ratios.append(float((spread * open_px2).sum()) / size**2)
     if not ratios:
         return None
-    order = np.argsort(ratios)
-    weight = np.square(sizes)[order]
-    middle = int(np.searchsorted(np.cumsum(weight), weight.sum() / 2))
-    square = float(np.clip(np.array(ratios)[order][middle], 0.0, 1.0))
+    weight = np.square(sizes)
+    square = float(np.clip(weighted_median(np.array(ratios), weight), 0.0, 1.0))
     # What the measurement leaves, or what the pairs disagree by, whichever is more.
     apart = 1.4826 * float(np.median(np.abs(np.array(ratios) - square))) / np.sqrt(len(ratios))
     std = max(SPREAD_PX2 / float(np.sqrt(weight.sum())), float(apart))
