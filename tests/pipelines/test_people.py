@@ -133,7 +133,8 @@ def test_with_masks_players_over_forty_per_cent_are_no_obstacle(crowded):
     rows = read_camera_csv(crowded / "out" / "camera.csv")
     assert (rows.shot == 0).all() and np.isfinite(rows.zoom_ratio).all()
     shot = compare_run(crowded / "out", crowded / "clip-truth.csv")["shots"][0]
-    assert shot["corner_px"] <= 1.0
+    # Corners over the whole shot follow the focal (stated to 2.6 %); what players would pull is the pairs themselves.
+    assert shot["transfer_px"] <= 0.3 and shot["inside_2_sigma"] == 1.0
     assert shot["zoom_rms"] <= 0.002
 
 

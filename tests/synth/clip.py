@@ -29,6 +29,9 @@ TRUTH_COLUMNS = (
     "frame", "pts_s", "f_px", "pan_deg", "tilt_deg", "roll_deg", "cx_px", "cy_px", "aspect", "k1", "shot",
 )  # fmt: skip
 _BITRATE_1080P25 = 8e6
+# x264's macroblock tree reads rows below the picture's last whole macroblock that nobody has written: the same frames
+# come out differently from run to run (heights of 180 and 540; never seen where half a macroblock is left, as at 1080).
+_MACROBLOCK_PX = 16
 _ROW_STEP_PX = 0.7  # of motion between the pictures that a rolling shutter's rows are mixed from
 _BLUR_STEP_PX = 1.5  # spacing of the sub-exposures of motion blur
 
@@ -379,6 +382,8 @@ def _container(path: Path) -> str | None:
 def _open_stream(container: av.container.OutputContainer, spec: ClipSpec) -> av.VideoStream:
     """Encoder stream, tagged BT.709 limited range."""
     options = {"preset": spec.x264_preset} if spec.codec in ("libx264", "libx265") else {}
+    if spec.codec == "libx264" and spec.height % _MACROBLOCK_PX not in (0, _MACROBLOCK_PX // 2):
+        options["x264-params"] = "mbtree=0"
     if spec.crf is not None:
         options["crf"] = str(spec.crf)
     stream = container.add_stream(spec.codec, rate=spec.fps, options=options)
