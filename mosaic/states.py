@@ -101,7 +101,10 @@ def _find(views, seen, frames, composite, contested, colour, value, moments, sho
     of what these views' evidence says. shows (n, h, w): which of the states a view shows, -1: none."""
     n, height, width = seen.shape
     present = np.empty(n, np.int64)
-    seen_colour = np.empty((n + 1, 3), np.int32)
+    # A plane a colour, and differences to all of them before any is asked about: these loops run in vectors.
+    own = np.empty((3, n + 1), np.int32)
+    apart = np.empty(n + 1, np.int32)
+    evidence, when = np.empty(n, np.float32), np.empty(n, np.int64)
     worth = np.empty(n + 1, np.float32)
     n_at = np.empty(n + 1, np.int64)
     for i in range(height):
@@ -111,28 +114,30 @@ def _find(views, seen, frames, composite, contested, colour, value, moments, sho
                 if seen[k, i, j]:
                     present[m] = k
                     for c in range(3):
-                        seen_colour[m, c] = views[k, i, j, c]
+                        own[c, m] = views[k, i, j, c]
+                    evidence[m], when[m] = np.float32(views[k, i, j, 3]) - np.float32(128), frames[k]
                     m += 1
             for c in range(3):
-                seen_colour[m, c] = composite[i, j, c]
+                own[c, m] = composite[i, j, c]
             if not contested[i, j]:
                 value[i, j, 0] = 0
                 for c in range(3):
                     colour[i, j, 0, c] = composite[i, j, c]
+                _measure(own, m, m, apart)
                 for b in range(m):
-                    if _apart(seen_colour, m, b) <= 4 * SAME_GREY:
+                    if apart[b] <= 4 * SAME_GREY:
                         shows[present[b], i, j] = 0
                 continue
             for a in range(m + 1):
                 last, n_moments, n_same, says = -MOMENT_FRAMES, 0, 0, np.float32(0)
+                _measure(own, a, m, apart)
                 for b in range(m):
-                    if _apart(seen_colour, a, b) > 4 * SAME_GREY:
+                    if apart[b] > 4 * SAME_GREY:
                         continue
-                    k = present[b]
                     n_same += 1
-                    says += np.float32(views[k, i, j, 3]) - np.float32(128)
-                    if frames[k] - last >= MOMENT_FRAMES:
-                        last = frames[k]
+                    says += evidence[b]
+                    if when[b] - last >= MOMENT_FRAMES:
+                        last = when[b]
                         n_moments += 1
                 worth[a] = NEVER
                 n_at[a] = n_moments
@@ -148,22 +153,21 @@ def _find(views, seen, frames, composite, contested, colour, value, moments, sho
                 value[i, j, s] = worth[best]
                 moments[i, j, s] = min(n_at[best], 255)
                 for c in range(3):
-                    colour[i, j, s, c] = seen_colour[best, c]
+                    colour[i, j, s, c] = own[c, best]
+                _measure(own, best, m + 1, apart)
                 for a in range(m + 1):
-                    if _apart(seen_colour, best, a) <= 4 * SAME_GREY:
+                    if apart[a] <= 4 * SAME_GREY:
                         worth[a] = NEVER
                         if a < m:
                             shows[present[a], i, j] = s
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _apart(colour, a, b):  # type: ignore[no-untyped-def]
-    """Four times the mean difference of two colours, green twice."""
-    return (
-        abs(colour[a, 0] - colour[b, 0])
-        + 2 * abs(colour[a, 1] - colour[b, 1])
-        + abs(colour[a, 2] - colour[b, 2])
-    )
+@numba.njit(cache=True, nogil=True)
+def _measure(own, a, count, apart):  # type: ignore[no-untyped-def]
+    """Four times the mean difference of colour a to each of the first `count` of own (3, n), green twice, to apart."""
+    red, green, blue = own[0, a], own[1, a], own[2, a]
+    for b in range(count):
+        apart[b] = abs(own[0, b] - red) + 2 * abs(own[1, b] - green) + abs(own[2, b] - blue)
 
 
 @numba.njit(cache=True, nogil=True)

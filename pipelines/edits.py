@@ -77,7 +77,12 @@ class _Seen:
     low: FloatImage
     band: FloatImage
     to_now: NDArray[np.float64]  # motion since some frame before or among those kept, small px
+    contrast: float
+    fine_contrast: float
     own: float = float("nan")  # share of blocks kept over LAG frames up to this one
+    change: FloatImage | None = (
+        None  # since the picture before, that motion does not explain; see EditFinder._change
+    )
 
 
 class EditFinder:
@@ -106,7 +111,13 @@ class EditFinder:
             H /= np.cbrt(np.linalg.det(H)) if np.linalg.det(H) > 0 else 1.0
         fine = cv2.GaussianBlur(small, (0, 0), 1.5)
         broad = cv2.GaussianBlur(small, (0, 0), 8)
-        self._seen.append(_Seen(frame=frame, low=small, band=fine - broad, to_now=H))
+        band = fine - broad
+        self._seen.append(
+            _Seen(
+                frame=frame, low=small, band=band, to_now=H, contrast=float(small.std()),
+                fine_contrast=float(np.sqrt(_blocks(band * band)).mean()),
+            )
+        )  # fmt: skip
         n = len(self._seen)
         own = self._left(n - 1 - LAG, n - 1) if n > LAG else float("nan")
         self._seen[-1].own = own
@@ -259,14 +270,14 @@ class EditFinder:
     def _darkest(self, j: int, i: int) -> int | None:
         """The picture around an edit that has least contrast, if that is a fade's; None: there is no fade."""
         begin, end = self._first_kept(), len(self._seen) - 1
-        contrast = [float(s.low.std()) for s in self._seen]
+        contrast = [s.contrast for s in self._seen]
         k = min(range(max(begin, j - 6), min(end, i + 6) + 1), key=contrast.__getitem__)
         sides = max(contrast[begin : k + 1], default=0.0), max(contrast[k : end + 1], default=0.0)
         return k if contrast[k] < DARK * min(sides) else None
 
     def _contrast_left(self, last: int, first: int) -> float:
         """Least fine contrast within an edit (over three frames) against that of its ends; 1 where it is too short."""
-        fine = [float(np.sqrt(_blocks(s.band * s.band)).mean()) for s in self._seen]
+        fine = [s.fine_contrast for s in self._seen]
         begin, end = max(self._first_kept(), last - 4), min(first + 4, len(self._seen) - 1)
         old, new = np.median(fine[begin : last + 1]), np.median(fine[first : end + 1])
         if first - last < 4:
@@ -278,7 +289,7 @@ class EditFinder:
     def _fade(self, k: int) -> tuple[int, int]:
         """Last picture of full contrast before the k-th and first one after it."""
         begin, end = self._first_kept(), len(self._seen) - 1
-        contrast = [float(s.low.std()) for s in self._seen]
+        contrast = [s.contrast for s in self._seen]
         last, first = k, k
         least = 0.005 * max(contrast)
         # Two steps at once: the darkest picture may come twice.
@@ -296,11 +307,18 @@ class EditFinder:
         size = float((way * way).sum()) + 1e-6
         steps = np.zeros(end - begin)
         for k in range(begin + 1, end + 1):
-            a = cv2.warpPerspective(
+            steps[k - begin - 1] = float((self._change(k) * way).sum()) / size
+        return steps
+
+    def _change(self, k: int) -> FloatImage:
+        """What the k-th picture has, blurred, that motion from the one before does not explain; computed once."""
+        seen = self._seen[k]
+        if seen.change is None:
+            before = cv2.warpPerspective(
                 self._seen[k - 1].low, self._between(k - 1, k), SIZE, borderMode=cv2.BORDER_REPLICATE
             )
-            steps[k - begin - 1] = float((_blurred(self._seen[k].low - a) * way).sum()) / size
-        return steps
+            seen.change = _blurred(seen.low - before)
+        return seen.change
 
     def _way(self, last: int, first: int) -> FloatImage:
         old, new = _blurred(self._seen[last].low), _blurred(self._seen[first].low)

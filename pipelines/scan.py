@@ -87,7 +87,7 @@ def _vote(before: NDArray[np.float32], here: NDArray[np.float32], following: NDA
     around = here[:-2] + here[2:]
 
     def misfit(other: NDArray[np.float32], first_row: int) -> float:
-        return float(np.abs(around - 2 * other[1:-1])[first_row::2].mean()) / 2
+        return float(np.abs(around[first_row::2] - 2 * other[1:-1][first_row::2]).mean()) / 2
 
     # Row 0 of `around` belongs to line 1: its even rows are lines of the bottom field.
     if_top_first = misfit(before, 0) + misfit(following, 1)
