@@ -431,13 +431,14 @@ def plan_views(
         raise ValueError("no placement to plan a panorama for")
     lattice = lattice_of(surface)
     rating = rate_views(candidates, lattice, options)
+    outlines = _Outlines(candidates, surface)
 
     def chosen_for(n_views: int) -> tuple[set[int], NDArray[np.int32], int]:
         chosen, count, limit = select_views(
             rating, candidates, options, n_views=n_views, min_gap=options.min_gap
         )
         if chosen:
-            chosen = [*chosen, *_cover_rest(candidates, chosen, surface, limit // 2)]
+            chosen = [*chosen, *_cover_rest(outlines, chosen, limit // 2)]
         return {candidates[i].frame for i in chosen}, count, limit
 
     frames, count, limit = chosen_for(options.views)
@@ -499,27 +500,42 @@ def _n_moments_clear(frames: NDArray[np.int64], clear: NDArray[np.bool_]) -> NDA
     return count
 
 
-def _cover_rest(
-    placements: Sequence[Placement], chosen: Sequence[int], surface: Surface, limit: int
-) -> list[int]:
+class _Outlines:
+    """The cells of a surface that each placement covers, drawn when they are asked for, once."""
+
+    def __init__(self, placements: Sequence[Placement], surface: Surface) -> None:
+        self._placements, self._surface = placements, surface
+        self._step = max(surface.width, surface.height) / COVER_CELLS
+        self.shape = (int(np.ceil(surface.height / self._step)), int(np.ceil(surface.width / self._step)))
+        self._cells: dict[int, NDArray[np.uint8]] = {}  # as bits: 10 kB each
+
+    def __len__(self) -> int:
+        return len(self._placements)
+
+    def __getitem__(self, i: int) -> NDArray[np.intp]:
+        """Flat numbers of the cells that the i-th placement covers, ascending."""
+        if i not in self._cells:
+            own = np.zeros(self.shape, np.uint8)
+            _draw_outline(own, self._placements[i], self._surface, self._step)
+            self._cells[i] = np.packbits(own)
+        return np.flatnonzero(np.unpackbits(self._cells[i]))
+
+
+def _cover_rest(outlines: _Outlines, chosen: Sequence[int], limit: int) -> list[int]:
     """Further placements, `limit` at most, that see what none of the chosen ones does: strips between lattice points,
     and what only a coarse or blurred frame reaches."""
-    step = max(surface.width, surface.height) / COVER_CELLS
-    shape = (int(np.ceil(surface.height / step)), int(np.ceil(surface.width / step)))
-    covered = np.zeros(shape, np.uint8)
+    open_cells = np.ones(outlines.shape[0] * outlines.shape[1], bool)
     for i in chosen:
-        _draw_outline(covered, placements[i], surface, step)
+        open_cells[outlines[i]] = False
     taken = set(chosen)
     gains: list[tuple[int, NDArray[np.intp]]] = []
-    for i, placement in enumerate(placements):
+    for i in range(len(outlines)):
         if i not in taken:
-            own = np.zeros(shape, np.uint8)
-            _draw_outline(own, placement, surface, step)
-            new = np.flatnonzero((own > covered).ravel())
+            new = outlines[i]
+            new = new[open_cells[new]]
             if len(new):
                 gains.append((i, new))
     added: list[int] = []
-    open_cells = covered.ravel() == 0
     while gains and len(added) < limit:
         counts = [int(open_cells[cells].sum()) for _, cells in gains]
         best = int(np.argmax(counts))
