@@ -22,7 +22,7 @@ from mosaic.pyramid import Pyramid
 from mosaic.records import FloatArray, PairFit, PairStatus
 from mosaic.stiff import StiffHomographyFamily
 from mosaic.template import PreparedTemplate, prepare
-from mosaic.warp import WarpFamily
+from mosaic.warp import WarpFamily, nearest_state
 
 # px; the finest level at most this wide is swept: lines of a pitch are still seen there.
 LEVEL_WIDTH = 320
@@ -157,17 +157,7 @@ def shift_starts(
 def shifted(family: WarpFamily, state: Any, prepared: Any, shift_px: FloatArray) -> Any:
     """The state of any family that moves the prepared points nearest to where `state` does, plus the shift (2,) px."""
     where, _, _ = family.warp(state, prepared)
-    wanted = where + shift_px
-    for _ in range(4):
-        now, J, _ = family.warp(state, prepared)
-        away = wanted - now
-        good = np.isfinite(away).all(axis=1)
-        if good.sum() < 8:
-            return state
-        J_good = J[good].reshape(-1, J.shape[2]).astype(np.float64)
-        step = np.linalg.lstsq(J_good, away[good].ravel(), rcond=None)[0]
-        state = family.update(state, np.asarray(step, np.float64))
-    return state
+    return nearest_state(family, state, prepared, where + shift_px)
 
 
 def _placed(

@@ -76,6 +76,20 @@ class HomographyFamily:
         return normalise_homography(state)
 
 
+def nearest_state(family: WarpFamily, state: Any, prepared: Any, wanted_px: FloatArray) -> Any:
+    """The state of a family, from one nearby, that moves prepared points nearest to where they are wanted (n, 2)."""
+    for _ in range(4):
+        now, J, _ = family.warp(state, prepared)
+        away = wanted_px - now
+        good = np.isfinite(away).all(axis=1)
+        if good.sum() < 8:
+            return state
+        J_good = J[good].reshape(-1, J.shape[2]).astype(np.float64)
+        step = np.linalg.lstsq(J_good, away[good].ravel(), rcond=None)[0]
+        state = family.update(state, np.asarray(step, np.float64))
+    return state
+
+
 @nb.njit(cache=True, nogil=True)
 def _homography_warp(H, centre_x, centre_y, scale, src):  # type: ignore[no-untyped-def]
     """Points of src (n, 2) through H with Jacobian (n, 2, 8) of a left increment and A = d dst / d src.

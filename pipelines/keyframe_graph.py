@@ -29,6 +29,7 @@ from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairFit
 from mosaic.template import Template, prepare
 from pipelines.bridge import CameraPose, Rolling, RotationZoomFamily, homography_graph, pair_state
+from pipelines.crowd import MUCH, doubted
 from pipelines.shutter import Shutter
 
 log = logging.getLogger(__name__)
@@ -70,6 +71,10 @@ class KeyframeImages:
         os.pwrite(self._file, level.tobytes(), self._end)
         self._where[frame] = (self._end, level.shape, level.dtype)
         self._end += level.nbytes
+        self.put_scene(frame, scene)
+
+    def put_scene(self, frame: int, scene: NDArray[np.uint8] | None) -> None:
+        """What of a kept frame is scene, as in `put`, once more is known of it."""
         if scene is not None:
             self._scene[frame] = np.packbits(scene), scene.shape
 
@@ -116,6 +121,9 @@ class KeyframeImages:
             os.close(self._file)
             self._file = -1
             self._path.unlink(missing_ok=True)
+
+
+CROWDED_SCORE = 0.4  # to which the pairs of keyframes that people fill are believed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,19 +309,26 @@ def register_pairs(
         if not near:
             return []
         target = images.pyramid(b, n_levels, mask)
-        levels = (2, 1, 0) if len(target.levels) > 2 else None
-        return [
+        levels: tuple[int, ...] | None = (2, 1, 0) if len(target.levels) > 2 else None
+        crowded = target.mask is not None and target.mask.mean() < 1 - MUCH
+        register_options = options.register
+        if crowded:
+            # The poses are good to a few pixels, and on a coarse level people reach across their masks.
+            levels = (1, 0) if len(target.levels) > 1 else None
+            register_options = replace(register_options, score_ok=CROWDED_SCORE)
+        fits = [
             align(
                 rolling.seen(prepared[a], b) if rolling else prepared[a],
                 target,
                 pair_state(poses[a], poses[b]),
                 dst=b,
                 levels=levels,
-                options=options.register,
+                options=register_options,
                 route="keyframe pair",
             )[0]
             for _, a in near
         ]
+        return [doubted(fit) for fit in fits] if crowded else fits
 
     with ThreadPoolExecutor(options.threads) as workers:
         return list(chain.from_iterable(workers.map(register, sorted(poses))))

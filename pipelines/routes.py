@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.records import Lens
-from mosaic.coords import normalise_homography
+from mosaic.coords import normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
 from mosaic.pyramid import Pyramid
 from mosaic.records import PairFit, PairStatus
@@ -23,6 +23,7 @@ from mosaic.rivals import better_of_rivals
 from mosaic.screen import WIDER, moves_more_widely, without_still
 from mosaic.stiff import StiffHomographyFamily
 from mosaic.template import PreparedTemplate, prepare
+from mosaic.warp import nearest_state
 from pipelines.bridge import CameraPose, PairState, RotationZoomFamily, pair_state, pose_from_state
 from pipelines.chain import centre_motion
 from pipelines.keyframe_graph import distance_in_widths
@@ -47,13 +48,14 @@ class Motion:
 
     H_step (3, 3): a frame to the next, as eight parameters found it last. log_zoom, turn (3, 3): change of log f and
     R_next_frame, as the running camera's four found them last. missed_px: by how much that camera's last prediction
-    missed the centre; inf: there was none.
+    missed the centre; inf: there was none. found: the step is no prediction, but was found for this very pair.
     """
 
     H_step: FloatArray = field(default_factory=lambda: np.eye(3))
     log_zoom: float = 0.0
     turn: FloatArray = field(default_factory=lambda: np.eye(3))
     missed_px: float = np.inf
+    found: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,6 +133,21 @@ def _is_near(fit: PairFit, look: PreparedFrame, known: Known) -> bool:
     return bool(1 / RESCUED_ZOOM <= zoom <= RESCUED_ZOOM)
 
 
+def expecting(known: Known, H_look_previous: FloatArray, size_px: tuple[int, int]) -> Known:
+    """What is known, with the motion of a pair of this and the frame before in place of what was predicted."""
+    motion = replace(known.motion, H_step=H_look_previous, found=True)
+    if known.camera is not None:
+        before, lens = known.camera.previous, known.camera.lens
+        family = RotationZoomFamily(lens=lens, log_f_src=before.log_f)
+        x, y = (np.linspace(0.1, 0.9, n) * (side - 1) for n, side in zip((8, 5), size_px, strict=True))
+        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        state = nearest_state(
+            family, pair_state(before, before), family.prepare(points), transfer(H_look_previous, points)
+        )
+        motion = replace(motion, log_zoom=state.log_f - before.log_f, turn=state.R_dst_src)
+    return replace(known, motion=motion)
+
+
 def link(
     keyframe: Keyframe,
     pose: CameraPose,
@@ -166,9 +183,9 @@ def _in_eight_parameters(look: PreparedFrame, known: Known, options: RegisterOpt
     motion = known.motion
     if direct.usable:
         H = normalise_homography(H_frame_keyframe @ np.linalg.inv(known.H_previous_keyframe))
-        motion = replace(motion, H_step=H)
+        motion = replace(motion, H_step=H, found=False)
     elif step.usable:
-        motion = replace(motion, H_step=H_step)
+        motion = replace(motion, H_step=H_step, found=False)
     return Reached(fits=fits, motion=motion)
 
 
@@ -179,6 +196,11 @@ def _free_to_previous(
     predicted, still = known.motion.H_step, np.eye(3)
     source = prepare(known.previous.template, _free_family(look))
     levels = _neighbours_levels(look.pyramid)
+    if known.motion.found:
+        route = "eight parameters"
+        return align(
+            source, look.pyramid, predicted, dst=look.frame, levels=levels[-1:], options=options, route=route
+        )
     fit, H = align(
         source, look.pyramid, predicted, dst=look.frame, levels=levels, options=options, route="eight parameters"
     )  # fmt: skip
@@ -213,10 +235,14 @@ def _in_the_cameras_own(
         # Velocity from the frame-to-frame estimate alone: keyframe corrections are no motion (real-footage.md 7.5).
         missed_px = width_px * distance_in_widths(predicted, found, width_px)
         motion = replace(
-            motion, log_zoom=state.log_f - before.log_f, turn=state.R_dst_src, missed_px=missed_px
+            motion,
+            log_zoom=state.log_f - before.log_f,
+            turn=state.R_dst_src,
+            missed_px=missed_px,
+            found=False,
         )
     elif direct.usable:
-        motion = replace(motion, log_zoom=0.0, turn=np.eye(3), missed_px=np.inf)
+        motion = replace(motion, log_zoom=0.0, turn=np.eye(3), missed_px=np.inf, found=False)
     return Reached(fits=(step, direct), motion=motion)
 
 
@@ -233,6 +259,8 @@ def _camera_to_previous(
     start, still = pair_state(before, predicted), pair_state(before, before)
     source = prepare(known.previous.template, RotationZoomFamily(lens=camera.lens, log_f_src=before.log_f))
     levels = _neighbours_levels(look.pyramid)
+    if known.motion.found:
+        return align(source, look.pyramid, start, dst=look.frame, levels=levels[-1:], options=options)
     near = tuple(i for i in levels if i <= NEAR_LEVEL) if known.motion.missed_px < NEAR_PX else levels
     fit, state = align(source, look.pyramid, start, dst=look.frame, levels=near, options=options)
     if fit.status != PairStatus.OK and near != levels:

@@ -236,7 +236,7 @@ def _planned(job: _Job, placements: Sequence[CameraPlacement]) -> PanoramaPlan:
         return plan_panorama(placements, job.config)
 
     def mask(frame: int) -> NDArray[np.bool_] | None:
-        return both_masks(job.mask, tracker.screen_mask(frame))
+        return both_masks(job.mask, tracker.scene_mask(frame))
 
     glances = glances_of(images, {p.frame for p in placements}, mask, job.scratch)
     try:
@@ -262,9 +262,9 @@ def _registered_again(
         Retracker(
             tracker, first.solution, job.config.registration, tracker.register_options, rolling=rolling
         ),
-        MovingFinder({p.frame: p for p in placed}, planned, store, tracker.screen_mask),
+        MovingFinder({p.frame: p for p in placed}, planned, store, tracker.scene_mask),
         store,
-        planned=planned, mask=job.mask, stays=tracker.screen_mask, people=job.people, n_levels=job.n_levels,
+        planned=planned, mask=job.mask, stays=tracker.scene_mask, people=job.people, n_levels=job.n_levels,
         threads=job.config.run.threads or 2, progress=job.progress,
     )  # fmt: skip
 

@@ -95,7 +95,7 @@ def shot_record(
         files=tuple(files),
         status_counts=counts,
         timings_s=dict(shot.timings.seconds),
-        warnings=() if panorama is not None else (f"no panorama: {shot.no_panorama}",),
+        warnings=_warnings(tracker, shot),
     )
 
 
@@ -241,3 +241,12 @@ def pto_frames(panorama: Panorama) -> list[PtoFrame]:
             )
         )
     return frames
+
+
+def _warnings(tracker: ShotTracker, shot: CalibratedShot) -> tuple[str, ...]:
+    said = [] if shot.panorama is not None else [f"no panorama: {shot.no_panorama}"]
+    if tracker.crowded:
+        said.append(
+            f"people fill {len(tracker.crowded)} pictures: these were registered by the scene between them"
+        )
+    return tuple(said)

@@ -50,8 +50,10 @@ def solve_keyframes(
     """
     templates = {k: key.template for k, key in tracker.keyframes.items()}
     options = KeyframeOptions(
-        refine=refine_options_of(config), register=tracker.register_options, threads=config.run.threads or 2
-    )
+        refine=refine_options_of(config), register=tracker.register_options, threads=config.run.threads or 2,
+        # Between people a pair that the full model refuses is more often wrong than the model: no plainer one is tried.
+        torn_share=np.inf if tracker.crowded else KeyframeOptions().torn_share,
+    )  # fmt: skip
 
     def refined(chosen: Iterable[int], running: Solution | None) -> KeyframeResult:
         own = {k: templates[k] for k in chosen}

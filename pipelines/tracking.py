@@ -7,7 +7,7 @@ are registered in the camera's own four parameters (routes.py). Shot boundaries 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,12 @@ from mosaic.template import SelectionOptions, with_level
 from pipelines.bridge import CameraPose, edge_from_fit
 from pipelines.chain import Chain, centre_motion
 from pipelines.config import RegistrationOptions
+from pipelines.crowd import CrowdWatch, doubted
 from pipelines.keyframe_graph import KeyframeImages
 from pipelines.keyframes import Keyframe, KeyframePolicy
 from pipelines.preparation import PreparedFrame
 from pipelines.repeats import Repeats
-from pipelines.routes import Known, Motion, Reached, RunningCamera, link, recover, register
+from pipelines.routes import Known, Motion, Reached, RunningCamera, expecting, link, recover, register
 from pipelines.screen_masks import ScreenMasks
 
 TRUST_SIGMA = 0.3  # relative focal error at which four parameters already beat eight
@@ -84,11 +85,13 @@ class ShotTracker:
     _repeats: Repeats = field(default_factory=Repeats)
     _policy: KeyframePolicy = field(init=False)
     _screen: ScreenMasks = field(init=False)
+    _crowd: CrowdWatch = field(init=False)
 
     def __post_init__(self) -> None:
         self.calibrator = RunningCalibrator(self.size_px, priors=self.priors, options=RUNNING)
         self._policy = KeyframePolicy(size_px=self.size_px, options=self.options)
         self._screen = ScreenMasks(self.size_px)
+        self._crowd = CrowdWatch(selection_of(self.options))
 
     @property
     def trusts_camera(self) -> bool:
@@ -115,7 +118,7 @@ class ShotTracker:
             last = self.observations[-1]
             self._observe(look, last.status, "duplicate", 0.0, last.estimate)
             return True
-        reached = self._register(look, previous, costly=rescue)
+        reached, look = self._register(look, previous, costly=rescue)
         fits = reached.usable
         if not fits:
             return False
@@ -145,6 +148,20 @@ class ShotTracker:
         Found from pairs of neighbours, a few frames late; None: nothing stayed."""
         return self._screen.at(frame)
 
+    @property
+    def crowded(self) -> tuple[int, ...]:
+        """Frames that people fill, registered by the scene between them."""
+        return self._crowd.frames
+
+    def scene_mask(self, frame: int) -> NDArray[np.bool_] | None:
+        """The same as screen_mask, and without people where they filled the picture."""
+        stays, scene = self.screen_mask(frame), self._crowd.scene(frame)
+        if scene is None:
+            return stays
+        width, height = self.size_px
+        whole = np.repeat(np.repeat(scene > 0, 4, axis=0), 4, axis=1)[:height, :width]
+        return whole if stays is None else whole & stays
+
     def skip(self, frame: int, pts_s: float, status: str, reason: str) -> None:
         """Note a frame that was bridged or lost, so that the shot's list stays complete."""
         self.observations.append(
@@ -160,9 +177,12 @@ class ShotTracker:
         self.fits = [f for f in self.fits if f.src <= last and f.dst <= last]
         self.keyframes = {k: key for k, key in self.keyframes.items() if k <= last}
         self._screen.cut_back(last)
+        self._crowd.cut_back(last)
 
-    def _register(self, look: PreparedFrame, previous: PreparedFrame, *, costly: bool) -> Reached:
-        """The frame by the cheapest route that links it; pairs that fail are kept too."""
+    def _register(
+        self, look: PreparedFrame, previous: PreparedFrame, *, costly: bool
+    ) -> tuple[Reached, PreparedFrame]:
+        """The frame by the cheapest route that links it, and masked if people fill it; pairs that fail are kept too."""
         camera = None
         if self.trusts_camera and self._pose is not None:
             camera = RunningCamera(
@@ -173,11 +193,38 @@ class ShotTracker:
             H_previous_keyframe=self._chain.H_frame_keyframe, motion=self._motion, camera=camera,
         )  # fmt: skip
         reached = register(look, known, self.register_options)
+        reached, look = self._past_people(reached, look, known)
         self.fits.extend(reached.fits)
         if costly and not reached.usable:
             reached = recover(look, known, self.register_options)
             self.fits.extend(reached.fits)
-        return reached
+        return reached, look
+
+    def _past_people(
+        self, reached: Reached, look: PreparedFrame, known: Known
+    ) -> tuple[Reached, PreparedFrame]:
+        """What was reached or, where people fill the picture, what is without them; and the frame as it was used."""
+        crowd, step = self._crowd, reached.fits[0]
+        found = crowd.scene_between(known.previous, look, step)
+        if found is None:
+            return reached, look
+        before, masked = crowd.without_people(known.previous, look, found.scene)
+        known = expecting(self._without_people(known, before), found.fit.H_dst_src, self.size_px)
+        again = register(masked, known, self.register_options)
+        if not again.fits[0].usable:
+            return reached, look
+        crowd.accept(masked, look)
+        return replace(again, fits=tuple(doubted(fit) for fit in again.fits)), masked
+
+    def _without_people(self, known: Known, previous: PreparedFrame) -> Known:
+        """What is known, with the frame before without its people; it may be the keyframe."""
+        keyframe = known.keyframe
+        if known.follows_keyframe:
+            keyframe = self._as_keyframe(previous)
+            self.keyframes[keyframe.frame] = keyframe
+            if self.images is not None:
+                self.images.put_scene(previous.frame, previous.scene)
+        return replace(known, previous=previous, keyframe=keyframe)
 
     def _keyframe_pose(self, frame: int) -> CameraPose | None:
         pose = self.calibrator.pose(frame)
@@ -214,11 +261,15 @@ class ShotTracker:
         return fit
 
     def _add_keyframe(self, look: PreparedFrame) -> None:
-        template = with_level(look.template, look.pyramid, 0, options=selection_of(self.options))
-        self.keyframes[look.frame] = Keyframe(frame=look.frame, template=template, small=look.small)
+        self.keyframes[look.frame] = self._as_keyframe(look)
         if self.images is not None:
             self.images.put(look.frame, look.pyramid, look.scene)
         self._current, self._chain = look.frame, Chain()
+
+    def _as_keyframe(self, look: PreparedFrame) -> Keyframe:
+        options = self._crowd.selection_for(look)
+        template = with_level(look.template, look.pyramid, 0, options=options)
+        return Keyframe(frame=look.frame, template=template, small=look.small)
 
     def _observe(
         self, look: PreparedFrame, status: str, reason: str, motion_px: float, estimate: CameraEstimate | None
