@@ -8,6 +8,7 @@ along each direction.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -94,7 +95,7 @@ def _blurred(pyramid: Pyramid, covariance: FloatArray) -> Pyramid:
     first: Any = pyramid.levels[0]
     picture: Any = cv2.filter2D(first, -1, _smear(covariance))
     blurred = build_pyramid(picture, n_levels=len(pyramid.levels), smooth=False)
-    return Pyramid(levels=blurred.levels, scales=blurred.scales, size_px=pyramid.size_px, mask=pyramid.mask)
+    return replace(pyramid, levels=blurred.levels, scales=blurred.scales)
 
 
 def _smear(covariance: FloatArray) -> NDArray[np.float32]:

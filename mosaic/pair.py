@@ -3,7 +3,7 @@
 The direct estimator over all levels from a start or from identity; where that fails, again from phase correlation, from
 features, then from the shifts at which most pixels agree, and at last for a scene that only a minority of the pixels
 shows (minority.py). Whatever the start, the result is the direct estimator's and has to pass its score or, as a weak
-pair, show that the minority is a scene.
+pair, show that the minority is a scene; only where no pixels hold it, but many features do, it is theirs.
 """
 
 from __future__ import annotations
@@ -17,14 +17,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mosaic.blur import matched, spread_difference
+from mosaic.coded import blockiness
 from mosaic.coords import normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
 from mosaic.gray import as_gray, as_mask, as_planes, white_of
 from mosaic.kernels import KernelName
-from mosaic.minority import CLEARLY_MORE, agreement, best_minority
+from mosaic.minority import CLEARLY_MORE, agreement, best_minority, of_matches
 from mosaic.pyramid import Pyramid, build_pyramid, n_levels_for
 from mosaic.records import PAIR_REASONS, FloatArray, PairFit, PairStatus
-from mosaic.rescue import match_features, phase_correlation, small_gray, weak_feature_starts
+from mosaic.rescue import (
+    FAINT_CONTRAST,
+    match_features,
+    phase_correlation,
+    small_gray,
+    weak_feature_starts,
+)
 from mosaic.rivals import shift_starts
 from mosaic.template import PreparedTemplate, SelectionOptions, build_template, prepare
 from mosaic.turning import held
@@ -34,7 +41,7 @@ REASONS = {
     **PAIR_REASONS,
     "asymmetric": "the pictures the other way round give another homography",
     "inconsistent": "too many parts of the picture were found elsewhere than the homography puts them",
-    "minority": "only a minority of the pixels agree, though in regions all over the overlap",
+    "minority": "only a minority of the pixels agree, though in regions all over the overlap or with many features",
     "uncertain": "the pixels leave the homography open: the stated error of its anchors is large",
 }
 
@@ -46,6 +53,7 @@ _NO_VERDICT = ("low_overlap", "no_texture")
 SMALL, SMALL_AWAY = 0.75, 0.1
 
 FINE_PX = 1280  # width of the pictures of the second look for features
+N_FAINT = 12000  # features of the last look, of FAINT_CONTRAST
 
 _RANK = {PairStatus.OK: 0, PairStatus.WEAK: 1, PairStatus.FAILED: 2, PairStatus.SKIPPED: 3}
 
@@ -111,8 +119,8 @@ def register(
 
     Returns PairFit with src = 0 (a), dst = 1 (b): H_dst_src maps px of a into b, det 1, NaN when failed. reason: a
     code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation', 'features',
-    'fine features', 'shift' or 'minority' (minority.py), with ', blur matched' behind it where that was done; n_steps
-    counts all that were tried.
+    'fine features', 'shift', 'minority' or 'matches' (minority.py), with ', blur matched' behind it where that was
+    done; n_steps counts all that were tried.
     Raises ValueError or TypeError for pictures, masks or a start of the wrong shape, type or value.
     """
     options = options or PairOptions()
@@ -125,7 +133,12 @@ def register(
     gray = as_gray(planes[0], value), as_gray(planes[1], value)
     n_levels = min(n_levels_for((p.shape[1], p.shape[0])) for p in gray)
     source, target = (
-        build_pyramid(g, n_levels=n_levels, smooth=options.smooth, mask=as_mask(m, (g.shape[1], g.shape[0])))
+        replace(
+            build_pyramid(
+                g, n_levels=n_levels, smooth=options.smooth, mask=as_mask(m, (g.shape[1], g.shape[0]))
+            ),
+            blocks=blockiness(g),
+        )
         for g, m in zip(gray, (mask_a, mask_b), strict=True)
     )
     return register_pyramids(source, target, start=_checked(start), options=options)
@@ -212,7 +225,22 @@ def _best_of_starts(
     if not options.rescue or _n_pixels(prepared, 0) < enough:
         return replace(best, n_steps=n_steps)
     found, steps = _of_minority(source, target, prepared, best, options)
+    if found.status != PairStatus.OK and not found.score <= options.estimator.score_ok:
+        found = _of_faint_matches(source, target, prepared, found, options)
     return replace(found, n_steps=n_steps + steps)
+
+
+def _of_faint_matches(
+    source: Pyramid, target: Pyramid, prepared: PreparedTemplate, best: PairFit, options: PairOptions
+) -> PairFit:
+    """The best fit or, where features of ever so little contrast agree on one, theirs."""
+    small = _without_masked(source, FINE_PX), _without_masked(target, FINE_PX)
+    starts = weak_feature_starts(
+        *small, source.size_px, target.size_px, n_features=N_FAINT, n_starts=1, contrast=FAINT_CONTRAST
+    )
+    for start in starts:
+        return of_matches(prepared, target, start, best, options.estimator)
+    return best
 
 
 def _of_minority(
@@ -312,7 +340,7 @@ def _both_ways(
     that is over 1: a smear that is not the same in both pictures pulls the two ways apart, and no residual shows it.
     """
     levels = [i for i in (1, 0) if _n_pixels(reverse, i) >= options.estimator.min_pixels]
-    if not levels or options.symmetric_px is None:
+    if not levels or options.symmetric_px is None or not len(fit.flow.cell):
         return fit, 0
     back, _ = align(
         reverse, source, normalise_homography(np.linalg.inv(fit.H_dst_src)), dst=0, levels=levels,

@@ -16,13 +16,15 @@ from mosaic.coords import level_scale
 class Pyramid:
     """levels[0] is full size, each next about half; uint8 or float32. scales[l] as `coords.level_scale`.
 
-    mask: (h, w) uint8 at quarter size, 1 = usable, or None when every pixel is.
+    mask: (h, w) uint8 at quarter size, 1 = usable, or None when every pixel is. blocks: coded.blockiness of the picture
+    before the blur; 0 also where nobody asked for it.
     """
 
     levels: tuple[NDArray[np.generic], ...]
     scales: tuple[tuple[float, float], ...]
     size_px: tuple[int, int]
     mask: NDArray[np.uint8] | None
+    blocks: float = 0.0
 
     @property
     def mask_scale(self) -> tuple[float, float]:

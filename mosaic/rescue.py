@@ -16,7 +16,8 @@ from mosaic.records import FloatArray
 from mosaic.solve import newton_step
 from mosaic.stiff import StiffHomographyFamily
 
-CONTRAST, WEAK_CONTRAST = 0.04, 0.01  # of a feature, SIFT's measure: its usual one, and for grass
+# Of a feature, SIFT's measure: its usual one, for grass, and for what 40 % players leave of grass.
+CONTRAST, WEAK_CONTRAST, FAINT_CONTRAST = 0.04, 0.01, 0.003
 WEAK_PX = 1.0  # of a match that agrees: scrolling hoardings move by 2 px a frame against the scene
 LARGEST = 6.0  # zoom 1.6 is 2.6
 REACH_PX = 4.0  # of a similarity, which is not quite what a turn does
@@ -96,13 +97,14 @@ def weak_feature_starts(
     min_matches: int = 12,
     n_features: int = 6000,
     n_starts: int = 4,
+    contrast: float = WEAK_CONTRAST,
 ) -> Iterator[FeatureStart]:
     """Camera-like homographies H_dst_src (full px, det 1) from weak features too, each from the matches that are left.
 
     Strong features are of players, hoardings and lines; grass has weak ones. Whoever has most of either comes first,
     the scene perhaps second.
     """
-    found = _matches(src, dst, n_features, WEAK_CONTRAST, min_matches)
+    found = _matches(src, dst, n_features, contrast, min_matches)
     if found is None:
         return
     a, b = found

@@ -47,7 +47,7 @@ class TemplateLevel:
 class Template:
     """The registration template of a frame: pixels per level (None = level not built) and a coarse even sample.
 
-    wide_px (m, 2) full px with wide_values (m,) on level wide_level: for gain and offset.
+    wide_px (m, 2) full px with wide_values (m,) on level wide_level: for gain and offset. blocks: the pyramid's.
     """
 
     frame: int
@@ -56,6 +56,7 @@ class Template:
     wide_px: FloatArray
     wide_values: NDArray[np.float32]
     wide_level: int
+    blocks: float = 0.0
 
 
 def mask_arguments(pyramid: Pyramid) -> tuple[NDArray[np.uint8], float, float, bool]:
@@ -101,6 +102,7 @@ def build_template(
         wide_px=wide_px,
         wide_values=wide_values,
         wide_level=wide_level,
+        blocks=pyramid.blocks,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mosaic.coded import DISPLACED, displacement_px
 from mosaic.level import LevelPair, Linearised
 from mosaic.photometric import TUKEY
 from mosaic.records import N_CELLS, FloatArray
@@ -78,7 +79,8 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
 
     What an encoder copies is correlated over more than a cell, and the homography takes part of that with it: unseen.
     Seen is how kappa grows from a grid four times as fine to the cells (1.1 on clean pairs, 2.3 at CRF 23 to 35). It
-    grows on up to the size of the picture, five to eight cells: the covariance is multiplied by its square.
+    grows on up to the size of the picture, five to eight cells: the covariance is multiplied by its square. Where the
+    pictures show an encoder's blocks, these may be displaced besides (coded.displacement_px), together or apart.
     """
     level, kernel = pair.pixels, pair.kernel
     weight = kernel.robust_weights(fine.residual, np.float32(fine.sigma), True)
@@ -108,10 +110,24 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
     variance = max(kappa, fine.sigma**2)
     inverse = np.linalg.inv(N)
     covariance = growth**2 * (J8 @ (variance * inverse + inverse @ common @ inverse) @ J8.T)
+    away_px = displacement_px(pair.source.template.blocks, pair.target.blocks, fine.sigma)
+    if away_px > 0:
+        covariance += away_px**2 * (J8 @ inverse @ _displaced(pair, fine, weight) @ inverse @ J8.T)
     # Anchors at the horizon of a wrong homography move by anything.
     if not np.isfinite(covariance).all() or not np.linalg.cond(covariance) < 1e14:
         return unknown
     return np.linalg.inv(covariance)
+
+
+def _displaced(pair: LevelPair, fine: Linearised, weight: NDArray[np.float32]) -> FloatArray:
+    """Covariance (p, p) of the right side if all cells of each of DISPLACED were off by one px, each on its own."""
+    level, p = pair.pixels, fine.J.shape[2]
+    total = np.zeros((p, p))
+    for columns, rows in DISPLACED:
+        cell = _grid(level.src_px, pair.source.template.size_px, (columns, rows))
+        moments = pair.kernel.cell_moments(fine.G, fine.J, weight, cell, columns * rows)
+        total += np.einsum("cak,cbk->ab", moments, moments)
+    return total
 
 
 def _kappa(scores: FloatArray, N: FloatArray) -> float:

@@ -126,9 +126,9 @@ def answer(fit: PairFit, truth: np.ndarray, size_px: tuple[int, int]) -> dict[st
         "error_px": corner_error_px(fit.H_dst_src, truth, size_px),
         "chi2": float(d @ fit.info @ d) / 8 if known else None,
         "std_px": float(np.sqrt(np.trace(np.linalg.inv(fit.info)) / 8)) if known else None,
-        "away_px": [float(v) for v in np.quantile(away, [0.5, 0.7, 0.85])],
+        "away_px": [float(v) for v in np.quantile(away, [0.5, 0.7, 0.85])] if len(away) else None,
         "cells": fit.flow.cell.tolist(),
-        "cell_weight": float(np.mean(fit.flow.weight)),
+        "cell_weight": float(np.mean(fit.flow.weight)) if len(away) else None,
         "H": fit.H_dst_src.ravel().tolist(),
     }
 

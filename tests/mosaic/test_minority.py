@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from mosaic import pair
+from mosaic.coords import normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align, cost_at, judge_minority, settle
-from mosaic.minority import AGREE_GREY, SUPPORT
+from mosaic.minority import AGREE_GREY, SUPPORT, of_matches
 from mosaic.pair import REASONS, PairOptions, register
 from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairStatus
-from mosaic.rescue import weak_feature_starts
+from mosaic.rescue import FeatureStart, weak_feature_starts
 from mosaic.template import PreparedTemplate, build_template, prepare
 from mosaic.warp import HomographyFamily
 from tests.mosaic.textures import SIZE, as_uint8, blocks, corner_error_px, grid, homography, picture
@@ -39,9 +43,10 @@ def _prepared(a: np.ndarray, b: np.ndarray) -> tuple[PreparedTemplate, Pyramid]:
 def test_a_scene_that_shows_between_moving_things_is_found(seed, monkeypatch):
     a, b = _crowded(seed, 0.55, TURNED)
     fit = register(a, b)
-    assert (fit.status, fit.route) == (PairStatus.WEAK, "minority") and fit.reason in REASONS
+    assert fit.status == PairStatus.WEAK and fit.route in ("minority", "matches") and fit.reason in REASONS
     assert corner_error_px(fit.H_dst_src, TURNED) < 1.0
     monkeypatch.setattr(pair, "_of_minority", lambda source, target, prepared, best, options: (best, 0))
+    monkeypatch.setattr(pair, "_of_faint_matches", lambda source, target, prepared, best, options: best)
     before = register(a, b)
     assert not before.usable or corner_error_px(before.H_dst_src, TURNED) > 5.0
 
@@ -101,3 +106,50 @@ def test_without_texture_the_start_comes_back():
     state, steps = settle(source, target, H, levels=(0,), greys=(AGREE_GREY,), options=OPTIONS)
     assert steps == 0 and np.array_equal(state, H)
     assert list(weak_feature_starts(flat, flat, SIZE, SIZE)) == []
+
+
+def _matched(rng: np.random.Generator, n: int, px: float) -> FeatureStart:
+    """A start at the truth with n matches, each off by a normal deviate of px."""
+    src = rng.uniform([40, 40], [SIZE[0] - 40, SIZE[1] - 40], (n, 2))
+    dst = transfer(TURNED, src) + px * rng.normal(size=(n, 2))
+    return FeatureStart(H_dst_src=TURNED, src_px=src, dst_px=dst, within_px=2.0)
+
+
+def test_many_matches_are_an_answer_where_no_score_holds_one_and_few_are_none():
+    source, target = _prepared(*_crowded(1, 0.75, TURNED))
+    lost, _ = align(source, target, homography(60, -40), dst=1, levels=(0,), options=OPTIONS)
+    assert lost.status == PairStatus.FAILED
+    rng = np.random.default_rng(5)
+    found = of_matches(source, target, _matched(rng, SUPPORT, 0.3), lost, OPTIONS)
+    assert (found.status, found.reason, found.route) == (PairStatus.WEAK, "minority", "matches")
+    assert corner_error_px(found.H_dst_src, TURNED) < 1e-9
+    assert of_matches(source, target, _matched(rng, SUPPORT - 1, 0.3), lost, OPTIONS) is lost
+
+
+def test_matches_replace_an_alignment_that_they_contradict_and_leave_the_better_one():
+    source, target = _prepared(
+        as_uint8(picture(2), noise=2, seed=1), as_uint8(picture(2, TURNED), noise=2, seed=2)
+    )
+    right, _ = align(source, target, TURNED, dst=1, levels=(0,), options=OPTIONS)
+    start = _matched(np.random.default_rng(6), 80, 0.4)
+    assert of_matches(source, target, start, right, OPTIONS) is right
+    wrong = replace(right, H_dst_src=homography(-20, 9))
+    assert of_matches(source, target, start, wrong, OPTIONS).route == "matches"
+
+
+def test_the_stated_error_of_matches_is_that_of_their_scatter():
+    """Four times the variance of independent matches (TOGETHER), so a chi-square of a quarter for ones that are."""
+    source, target = _prepared(*_crowded(1, 0.75, TURNED))
+    lost, _ = align(source, target, homography(60, -40), dst=1, levels=(0,), options=OPTIONS)
+    chi2 = []
+    for seed in range(30):
+        start = _matched(np.random.default_rng(seed), 60, 0.5)
+        # The least-squares homography of the matches stands where a search would have ended.
+        H_ls, _ = cv2.findHomography(start.src_px, start.dst_px, 0)
+        fitted = FeatureStart(
+            H_dst_src=normalise_homography(H_ls), src_px=start.src_px, dst_px=start.dst_px, within_px=2.0
+        )
+        fit = of_matches(source, target, fitted, lost, OPTIONS)
+        d = (transfer(fit.H_dst_src, fit.anchors_px) - transfer(TURNED, fit.anchors_px)).ravel()
+        chi2.append(d @ fit.info @ d / 8)
+    assert 0.12 < np.mean(chi2) < 1.0
