@@ -153,3 +153,13 @@ def test_the_stated_error_of_matches_is_that_of_their_scatter():
         d = (transfer(fit.H_dst_src, fit.anchors_px) - transfer(TURNED, fit.anchors_px)).ravel()
         chi2.append(d @ fit.info @ d / 8)
     assert 0.12 < np.mean(chi2) < 1.0
+
+
+def test_what_matches_hold_is_not_aligned_again_by_pixels(monkeypatch):
+    source, target = _crowded(0, 0.55, TURNED)
+    assert register(source, target).route == "matches"
+    asked = []
+    monkeypatch.setattr(pair, "spread_difference", lambda *pictures: asked.append(pictures))
+    assert register(source, target).route == "matches" and not asked
+    register(*(as_uint8(picture(0, M), noise=2, seed=3) for M in (None, TURNED)))
+    assert len(asked) == 1
