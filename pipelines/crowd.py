@@ -41,6 +41,7 @@ class CrowdWatch:
     n_looks: int = 0
     _scene: dict[int, tuple[NDArray[np.uint8], tuple[int, ...]]] = field(default_factory=dict)
     _plain: PreparedFrame | None = None  # the frame before as it came, without a mask made here
+    _weak: set[int] = field(default_factory=set)  # frames of which weak pixels are used
     _quiet: int = 0
     _since: int = 0  # frames since the last look
     _wait: int = 0
@@ -115,9 +116,10 @@ class CrowdWatch:
         return np.unpackbits(bits, count=int(np.prod(shape))).reshape(shape)
 
     def selection_for(self, look: PreparedFrame) -> SelectionOptions:
-        """Which pixels stand for a frame: weak ones too where most of the strong ones are masked."""
-        masked = look.scene is not None and 1 - look.scene.mean() >= MUCH
-        return replace(self.selection, threshold_grey=WEAK_GREY) if masked else self.selection
+        """Which pixels stand for a frame: weak ones too where most of the strong ones were masked here."""
+        return (
+            replace(self.selection, threshold_grey=WEAK_GREY) if look.frame in self._weak else self.selection
+        )
 
     def _as_it_came(self, look: PreparedFrame) -> PreparedFrame:
         return self._plain if self._plain is not None and self._plain.frame == look.frame else look
@@ -126,6 +128,8 @@ class CrowdWatch:
         pyramid = with_scene(look.pyramid, scene)
         levels = tuple(range(finest_of(pyramid.size_px), len(pyramid.levels)))
         masked = replace(look, scene=scene if look.scene is None else np.minimum(scene, look.scene))
+        if 1 - scene.mean() >= MUCH:
+            self._weak.add(look.frame)
         options = self.selection_for(masked)
         return replace(
             masked,

@@ -29,7 +29,7 @@ from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import PairFit
 from mosaic.template import Template, prepare
 from pipelines.bridge import CameraPose, Rolling, RotationZoomFamily, homography_graph, pair_state
-from pipelines.crowd import MUCH, doubted
+from pipelines.crowd import doubted
 from pipelines.shutter import Shutter
 
 log = logging.getLogger(__name__)
@@ -130,12 +130,14 @@ CROWDED_SCORE = 0.4  # to which the pairs of keyframes that people fill are beli
 class KeyframeOptions:
     """max_rounds of registering and refining; settled: change of mean log f at which they stop. max_distance: widths
     between two centres up to which keyframes are paired (1 - overlap). torn_share: unlinked keyframes beyond which the
-    full model is given up for a plain one. threads: that register."""
+    full model is given up for a plain one. crowded: keyframes that people fill (pipelines/crowd.py). threads: that
+    register."""
 
     max_rounds: int = 8
     settled: float = 0.001
     max_distance: float = 0.8
     torn_share: float = 0.34
+    crowded: frozenset[int] = frozenset()
     threads: int = 1
     register: RegisterOptions = field(default_factory=RegisterOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
@@ -310,7 +312,7 @@ def register_pairs(
             return []
         target = images.pyramid(b, n_levels, mask)
         levels: tuple[int, ...] | None = (2, 1, 0) if len(target.levels) > 2 else None
-        crowded = target.mask is not None and target.mask.mean() < 1 - MUCH
+        crowded = b in options.crowded
         register_options = options.register
         if crowded:
             # The poses are good to a few pixels, and on a coarse level people reach across their masks.

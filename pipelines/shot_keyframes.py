@@ -52,7 +52,7 @@ def solve_keyframes(
     options = KeyframeOptions(
         refine=refine_options_of(config), register=tracker.register_options, threads=config.run.threads or 2,
         # Between people a pair that the full model refuses is more often wrong than the model: no plainer one is tried.
-        torn_share=np.inf if tracker.crowded else KeyframeOptions().torn_share,
+        torn_share=np.inf if tracker.crowded else KeyframeOptions().torn_share, crowded=frozenset(tracker.crowded),
     )  # fmt: skip
 
     def refined(chosen: Iterable[int], running: Solution | None) -> KeyframeResult:
