@@ -34,6 +34,12 @@ def level_scale(size_px: tuple[int, int], level_size_px: tuple[int, int]) -> tup
     return size_px[0] / level_size_px[0], size_px[1] / level_size_px[1]
 
 
+def level_matrix(scale: tuple[float, float]) -> FloatArray:
+    """`to_full` as a matrix (3, 3)."""
+    sx, sy = scale
+    return np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+
+
 def to_full(points_level: ArrayLike, scale: tuple[float, float]) -> FloatArray:
     """Level pixels (..., 2) to full-size pixels."""
     s = np.asarray(scale, np.float64)

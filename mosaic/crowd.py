@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.coords import transfer
+from mosaic.coords import level_matrix, transfer
 from mosaic.estimator import align
 from mosaic.minority import best_minority
 from mosaic.pair import PairOptions
-from mosaic.pyramid import Pyramid
+from mosaic.pyramid import Pyramid, with_scene
 from mosaic.records import FloatArray, PairFit
 from mosaic.rescue import small_gray, weak_feature_starts
 from mosaic.stiff import StiffHomographyFamily
@@ -62,11 +62,6 @@ class SceneFound:
     def share(self) -> float:
         """Of the target that goes with the pair."""
         return float(self.scene.target.mean())
-
-
-def with_scene(pyramid: Pyramid, scene: NDArray[np.uint8]) -> Pyramid:
-    """A pyramid whose mask leaves out what is no scene; scene at the size of that mask, 1 = scene."""
-    return replace(pyramid, mask=scene if pyramid.mask is None else np.minimum(scene, pyramid.mask))
 
 
 def find_scene(
@@ -132,8 +127,8 @@ def scene_of_pair(
     )
     a, b = (p.levels[index].astype(np.float32) for p in (source, target))
     height, width = a.shape
-    to_full = _to_full(source.scales[index])
-    H = np.linalg.inv(_to_full(target.scales[index])) @ fit.H_dst_src @ to_full
+    to_full = level_matrix(source.scales[index])
+    H = np.linalg.inv(level_matrix(target.scales[index])) @ fit.H_dst_src @ to_full
     seen = cv2.warpPerspective(
         b, H, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderValue=np.nan
     )
@@ -167,12 +162,6 @@ def _filled(moves: NDArray[np.uint8]) -> NDArray[np.uint8]:
     wider = cv2.copyMakeBorder(moves, border, border, border, border, cv2.BORDER_REPLICATE)
     closed = cv2.morphologyEx(wider, cv2.MORPH_CLOSE, _disc(FILLED_PX))
     return np.asarray(closed[border:-border, border:-border], np.uint8)
-
-
-def _to_full(scale: tuple[float, float]) -> FloatArray:
-    """(3, 3): level px to full px."""
-    sx, sy = scale
-    return np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
 
 
 def _range(plane: NDArray[Any]) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mosaic.blur import matched, spread_difference
 from mosaic.coded import blockiness
-from mosaic.coords import normalise_homography, transfer
+from mosaic.coords import level_matrix, level_scale, normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
 from mosaic.gray import as_gray, as_mask, as_planes, white_of
 from mosaic.kernels import KernelName
@@ -275,8 +275,7 @@ def _of_minority(
 
 def _scaling(source: Pyramid, target: Pyramid) -> FloatArray:
     """Area scaling of the one frame to the size of the other: identity for equal sizes."""
-    sx, sy = (t / s for s, t in zip(source.size_px, target.size_px, strict=True))
-    return np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+    return level_matrix(level_scale(target.size_px, source.size_px))
 
 
 def _ladders(route: str, levels: list[int]) -> list[list[int]]:

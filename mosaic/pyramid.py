@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import cv2
@@ -70,6 +70,11 @@ def build_pyramid(
             raise ValueError(f"mask {mask.shape} does not match the picture {gray.shape}")
         small = quarter_mask(mask)
     return Pyramid(levels=tuple(levels), scales=scales, size_px=size_px, mask=small)
+
+
+def with_scene(pyramid: Pyramid, scene: NDArray[np.uint8]) -> Pyramid:
+    """A pyramid whose mask leaves out what is no scene; scene at the size of that mask, 1 = scene."""
+    return replace(pyramid, mask=scene if pyramid.mask is None else np.minimum(scene, pyramid.mask))
 
 
 def block_minimum(plane: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:

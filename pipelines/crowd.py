@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.crowd import WEAK_GREY, SceneFound, ScenePair, find_scene, settle_scene, with_scene
-from mosaic.pyramid import Pyramid
+from mosaic.crowd import WEAK_GREY, SceneFound, ScenePair, find_scene, settle_scene
+from mosaic.pyramid import Pyramid, with_scene
 from mosaic.records import PairFit, PairStatus
 from mosaic.template import SelectionOptions, build_template
 from pipelines.preparation import PreparedFrame, finest_of

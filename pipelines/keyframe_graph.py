@@ -25,7 +25,7 @@ from calib.records import HomographyGraph, Priors, Solution
 from calib.refine import RefineOptions, refine
 from calib.rolling_shutter import RollingShutter
 from mosaic.estimator import RegisterOptions, align
-from mosaic.pyramid import Pyramid, build_pyramid
+from mosaic.pyramid import Pyramid, build_pyramid, with_scene
 from mosaic.records import PairFit
 from mosaic.template import Template, prepare
 from pipelines.bridge import CameraPose, Rolling, RotationZoomFamily, homography_graph, pair_state
@@ -89,7 +89,7 @@ class KeyframeImages:
             return pyramid
         bits, size = self._scene[frame]
         scene = np.unpackbits(bits, count=int(np.prod(size))).reshape(size)
-        return replace(pyramid, mask=scene if pyramid.mask is None else np.minimum(scene, pyramid.mask))
+        return with_scene(pyramid, scene)
 
     def put_glance(self, frame: int, pyramid: Pyramid) -> None:
         """Keep a small picture of a frame, unless one of the GLANCE_EVERY frames before has one. Frames in order."""

@@ -103,8 +103,11 @@ class Reached:
 def register(look: PreparedFrame, known: Known, options: RegisterOptions) -> Reached:
     """The frame against the one before it, from the motion so far, then against the keyframe."""
     if known.camera is None:
-        return _in_eight_parameters(look, known, options)
-    return _in_the_cameras_own(look, known, known.camera, options)
+        reached = _in_eight_parameters(look, known, options)
+    else:
+        reached = _in_the_cameras_own(look, known, known.camera, options)
+    # For the next frame it is a prediction, whatever it was for this one.
+    return replace(reached, motion=replace(reached.motion, found=False))
 
 
 def recover(look: PreparedFrame, known: Known, options: RegisterOptions) -> Reached:
@@ -183,9 +186,9 @@ def _in_eight_parameters(look: PreparedFrame, known: Known, options: RegisterOpt
     motion = known.motion
     if direct.usable:
         H = normalise_homography(H_frame_keyframe @ np.linalg.inv(known.H_previous_keyframe))
-        motion = replace(motion, H_step=H, found=False)
+        motion = replace(motion, H_step=H)
     elif step.usable:
-        motion = replace(motion, H_step=H_step, found=False)
+        motion = replace(motion, H_step=H_step)
     return Reached(fits=fits, motion=motion)
 
 
@@ -239,10 +242,9 @@ def _in_the_cameras_own(
             log_zoom=state.log_f - before.log_f,
             turn=state.R_dst_src,
             missed_px=missed_px,
-            found=False,
         )
     elif direct.usable:
-        motion = replace(motion, log_zoom=0.0, turn=np.eye(3), missed_px=np.inf, found=False)
+        motion = replace(motion, log_zoom=0.0, turn=np.eye(3), missed_px=np.inf)
     return Reached(fits=(step, direct), motion=motion)
 
 

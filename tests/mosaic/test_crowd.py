@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mosaic.crowd import find_scene, scene_of_pair, settle_scene, with_scene
+from mosaic.crowd import find_scene, scene_of_pair, settle_scene
 from mosaic.estimator import RegisterOptions, align
-from mosaic.pyramid import build_pyramid
+from mosaic.pyramid import build_pyramid, with_scene
 from mosaic.template import build_template, prepare
 from mosaic.warp import HomographyFamily
 from tests.mosaic.textures import as_uint8, corner_error_px, homography, picture
