@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.coords import normalise_homography, transfer
+from mosaic.coords import level_matrix, level_scale, normalise_homography, transfer
 from mosaic.photometric import TUKEY
 from mosaic.pyramid import Pyramid
 from mosaic.records import FloatArray
@@ -50,8 +50,7 @@ def small_gray(pyramid: Pyramid, width_px: int = 640) -> NDArray[np.uint8]:
 
 
 def _level_to_full(size_px: tuple[int, int], small: NDArray[np.uint8]) -> FloatArray:
-    sx, sy = size_px[0] / small.shape[1], size_px[1] / small.shape[0]
-    return np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]])
+    return level_matrix(level_scale(size_px, (small.shape[1], small.shape[0])))
 
 
 def phase_correlation(
