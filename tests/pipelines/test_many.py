@@ -181,9 +181,11 @@ def test_workers_end_with_the_program(tmp_path: Path, how: signal.Signals) -> No
     out = tmp_path / "out"
     command = [sys.executable, str(tmp_path / "start.py"), "run", "for-ever-1", "for-ever-2", "-o", str(out)]
     root = str(Path(cli.__file__).parent.parent)
+    # A shell has what it puts in the background (make test &) ignore interrupts, and children inherit that.
     running = subprocess.Popen(
-        [*command, "--jobs", "2"], stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": root}
-    )
+        [*command, "--jobs", "2"], stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": root},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     try:
         until = time.monotonic() + 60
         while len(list(out.glob("for-ever-*"))) < 2:
@@ -195,6 +197,7 @@ def test_workers_end_with_the_program(tmp_path: Path, how: signal.Signals) -> No
         stderr = running.communicate(timeout=30)[1]
     finally:
         running.kill()
+        running.wait()
     assert running.returncode == (130 if how == signal.SIGINT else -9)
     if how == signal.SIGINT:
         assert "--resume" in stderr and "Traceback" not in stderr
