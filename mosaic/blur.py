@@ -28,21 +28,38 @@ LEAST_PX2 = 3.5
 
 
 def spread_difference(
-    a: Pyramid, b: Pyramid, H_b_a: FloatArray, gain: float, offset: float
+    a: Pyramid,
+    b: Pyramid,
+    H_b_a: FloatArray,
+    gain: float,
+    offset: float,
+    *,
+    level: int = _LEVEL,
+    most_px: int | None = None,
 ) -> FloatArray | None:
     """Covariance (2, 2) px^2 of b's point spread less that of a, in a's axes; None where too little shows it.
 
-    H_b_a aligns them to a pixel or two, a ~ gain b + offset. A picture is its twin blurred by S: b = a + tr(S
-    Hessian) / 2, to third order when the Hessian is that of the mean of both.
+    H_b_a aligns them to a pixel or two of the level, a ~ gain b + offset. A picture is its twin blurred by S: b = a +
+    tr(S Hessian) / 2, to third order when the Hessian is that of the mean of both. level: of the pyramids; it is found
+    to about 2 px^2 at level 2 and, where it is that small, to a quarter of that on each finer one. most_px: side of
+    the part that is looked at, px of the level, in the middle of what both see; None: all.
     """
-    index = min(_LEVEL, len(a.levels) - 1, len(b.levels) - 1)
+    index = min(level, len(a.levels) - 1, len(b.levels) - 1)
     (ax, ay), (bx, by) = a.scales[index], b.scales[index]
     up = np.array([[ax, 0, (ax - 1) / 2], [0, ay, (ay - 1) / 2], [0, 0, 1.0]])
     down = np.linalg.inv(np.array([[bx, 0, (bx - 1) / 2], [0, by, (by - 1) / 2], [0, 0, 1.0]]))
     first: Any = np.asarray(a.levels[index], np.float32)
-    h, w = first.shape
     second: Any = np.asarray(b.levels[index], np.float32) * np.float32(gain) + np.float32(offset)
     H = down @ H_b_a @ up
+    usable: Any = a.mask
+    if usable is not None:
+        usable = cv2.resize(usable, first.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    if most_px is not None:
+        x, y = _middle_of_both(first.shape, second.shape, H, most_px)
+        box = np.s_[y : y + most_px, x : x + most_px]
+        first, usable = first[box], None if usable is None else usable[box]
+        H = H @ np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
+    h, w = first.shape
     # Linear sampling would itself blur, by 2.7 px^2 of the full size.
     flags = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(
@@ -53,8 +70,8 @@ def spread_difference(
     # Sobel's own weights: 4 for second derivatives of size 3, and 4 for the mixed one.
     rows = np.stack([xx / 4, xy / 2, yy / 4], axis=-1) / 2
     good = cv2.erode((warped > -1e3).astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=0) > 0
-    if a.mask is not None:
-        good &= cv2.resize(a.mask, (w, h), interpolation=cv2.INTER_NEAREST) > 0
+    if usable is not None:
+        good &= usable > 0
     good &= np.linalg.norm(rows, axis=-1) > _LEAST_CURVATURE / 2
     if good.sum() < _LEAST_PIXELS:
         return None
@@ -71,6 +88,16 @@ def spread_difference(
             return None
         s = np.linalg.solve(N, M.T @ (weight * residual))
     return np.array([[s[0] * ax * ax, s[1] * ax * ay], [s[1] * ax * ay, s[2] * ay * ay]])
+
+
+def _middle_of_both(
+    shape: tuple[int, int], other: tuple[int, int], H_other: FloatArray, side: int
+) -> tuple[int, int]:
+    """Corner x, y of a square about the middle of what a picture (h, w) and another one see, inside the first."""
+    (h, w), (other_h, other_w) = shape, other
+    p = np.linalg.inv(H_other) @ np.array([(other_w - 1) / 2, (other_h - 1) / 2, 1.0])
+    x, y = ((p[:2] / p[2] + [(w - 1) / 2, (h - 1) / 2]) / 2 - side / 2).round().astype(int)
+    return int(np.clip(x, 0, max(w - side, 0))), int(np.clip(y, 0, max(h - side, 0)))
 
 
 def matched(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mosaic.canvas import Canvas
+from mosaic.detail import give_back_detail
 from mosaic.framestore import COARSE, FrameStore
 from mosaic.gains import solve_log_gains
 from mosaic.moving import find_still, shown_clear
@@ -121,6 +122,10 @@ def composite(
         scene = replace(scene, still=still, quiet=quiet, vote=vote)
     canvas = Canvas(scratch or tempfile.gettempdir(), options.memory_bytes)
     layers = paint(replace(scene, deep=store.deep), canvas, progress)
+    give_back_detail(
+        layers.image, layers.deep, layers.n_seen, canvas,
+        share=options.detail, sigma_px=surface.scale_px / max(p.px_per_rad for p in views),
+    )  # fmt: skip
     alpha = canvas.zeros(layers.n_seen.shape)
     for top in range(0, surface.height, STRIP_ROWS):  # not at once: both may be larger than memory
         rows = np.s_[top : top + STRIP_ROWS]

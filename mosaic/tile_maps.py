@@ -205,7 +205,7 @@ def _node_values(xy, table, i0, v, j0, u, floor, fineness, width, height, margin
             inside = max(central, 0.04)
             # To decide what stands still, who sees it best counts a little; to paint it, the sharp views count most.
             grid[i, j, 2] = vote * (0.3 + 0.7 * inside) * min(max(ratio, 0.25), 2.0)
-            grid[i, j, 3] = member * inside * max(sharp**4, 0.002 * ratio)
+            grid[i, j, 3] = member * inside * max(sharp**8, 0.002 * ratio)
             if central * ratio * vote > 0:
                 total += central * (grid[i, j, 2] + grid[i, j, 3])
     return total

@@ -28,6 +28,8 @@ LEAST_CLEAR = 0.1  # a view that shows less of the ground about a point is of no
 # Share of a picture below which it is not stored for the ground that it alone shows: a player in a wide shot, 25 x 60
 # of 1280 x 720 px.
 BODY_SHARE = 1 / 600
+# Variance of the point spread of a frame that does not move, px^2: its pixels (1/12), its lens and its coder.
+STILL_SPREAD_PX2 = 1 / 3
 MOMENT_FRAMES = 6  # views nearer than this say the same about a place
 LEAST_RATIO = 0.08  # of the resolution floor: a view coarser than this does not even vote
 
@@ -50,6 +52,7 @@ class CompositeOptions:
     together: decide for all pixels at once what is seen side by side (states.py), not for each by itself.
     quiet_views: views sampled where all agree about what they show (moving.py): 7 to 25 differ by .05 dB there, and
     half of the time goes into sampling.
+    detail: share of the fine detail that frames' pixels average away and that is given back (detail.py); 0 = none.
     max_candidates: frames looked at when planning; a longer clip is thinned, the least blurred of each group stays.
     """
 
@@ -75,6 +78,7 @@ class CompositeOptions:
     motion_rounds: int = 2
     together: bool = True
     quiet_views: int = 9
+    detail: float = 0.2
 
     def __post_init__(self) -> None:
         if not 1 <= self.views <= self.max_views <= 255:
@@ -137,8 +141,9 @@ def lattice_of(surface: Surface, n_points: int = 1200) -> Lattice:
 
 
 def resolution(placement: Placement) -> float:
-    """Resolution of a frame in px per radian, lessened by its motion blur."""
-    return float(placement.px_per_rad / np.sqrt(1.0 + placement.blur_px**2))
+    """Resolution of a frame in px per radian, lessened by its motion blur: by how much wider that makes its point
+    spread along the motion."""
+    return float(placement.px_per_rad / np.sqrt(1.0 + placement.blur_px**2 / 12 / STILL_SPREAD_PX2))
 
 
 def centrality(xy: NDArray[np.float64], size_px: tuple[int, int], margin_px: float) -> NDArray[np.float32]:

@@ -357,6 +357,13 @@ class PanoramaOptions(Section):
         ),
     )
 
+    detail: float = Field(
+        default=0.2,
+        ge=0,
+        le=1,
+        description="share of the fine detail that pixels average away and that is given back; 0 = as in the frames",
+    )
+
     @field_validator("moment_frames", mode="before")
     @classmethod
     def _numbers(cls, value: Any) -> Any:

@@ -46,7 +46,7 @@ def plan_panorama(
     glances: small pictures of some of them, in which bodies are looked for.
 
     views.frames is empty where the panorama would be too small for any frame to be believed in it."""
-    options = CompositeOptions(views=config.panorama.views)
+    options = CompositeOptions(views=config.panorama.views, detail=config.panorama.detail)
     stride = max(1, len(placements) // MAX_PLACEMENTS_FOR_SURFACE)
     surface = choose_surface(
         placements[::stride], config.panorama.projection, max_pixels=config.panorama.max_megapixels * 1e6

@@ -38,6 +38,15 @@ def test_the_smear_is_measured_along_its_own_axis(length_px, upright):
     assert (matched(a, b, found, H) is None) == (length_px == 1)
 
 
+@pytest.mark.parametrize("length_px", [1, 3])
+def test_a_small_smear_is_measured_in_a_part_of_the_finest_level(length_px):
+    """Truth 0 and .67 px^2, which a quarter of the size cannot tell from each other."""
+    a, b = (build_pyramid(p) for p in pair(length_px, False))
+    found = spread_difference(a, b, H, 1.0, 0.0, level=0, most_px=400)
+    assert found[0, 0] == pytest.approx((length_px**2 - 1) / 12, abs=0.25)
+    assert abs(found[1, 1]) < 0.25 and abs(found[0, 1]) < 0.25
+
+
 def test_matching_the_smear_brings_the_corners_closer():
     """9 px of smear in one picture: .3 px at the corners, .1 px matched."""
     errors = []

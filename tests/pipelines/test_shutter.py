@@ -27,14 +27,14 @@ def shift(dx):
 class Smeared:
     """Pictures of one texture, each 7 px on from the one before, smeared along x by share x speed."""
 
-    def __init__(self, share, noise=1.5):
+    def __init__(self, share, noise=1.5, speeds=SPEEDS):
         rng = np.random.default_rng(4)
         wide = cv2.GaussianBlur(rng.normal(0, 1, (360, 900)).astype(np.float32), (0, 0), 1.2)
         self.world = np.clip(128 + 40 * wide / wide.std(), 0, 255)
-        self.share, self.noise, self.rng = share, noise, rng
+        self.share, self.noise, self.rng, self.speeds = share, noise, rng, speeds
 
     def pyramid(self, frame, n_levels, mask):
-        length = self.share * SPEEDS[frame]
+        length = self.share * self.speeds[frame]
         n = 64
         kernel = np.zeros((1, 2 * n + 1), np.float32)
         x = np.linspace(-length / 2, length / 2, 400)
@@ -51,7 +51,7 @@ def found(share, speeds=SPEEDS, **changes):
     frames = sorted(speeds)
     pairs = [pair(a, b, shift(-7 * (b - a) / 10), **changes) for a in frames for b in frames if a < b]
     steps = [pair(k - 1, k, shift(-v)) for k, v in speeds.items()]
-    return find_shutter(pairs, steps, Smeared(share), SIZE_PX, 4, None)
+    return find_shutter(pairs, steps, Smeared(share, speeds=speeds), SIZE_PX, 4, None)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
@@ -61,6 +61,13 @@ def test_the_share_that_pictures_were_smeared_by(share):
     # At .4 the smear of 12 px is no small change any more: see the module.
     assert shutter.share == pytest.approx(share, abs=max(0.12, 0.25 * share))
     assert abs(shutter.share - share) <= 3 * shutter.share_std + 0.1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5])
+def test_smears_too_small_for_reduced_pictures_are_seen_in_finer_ones(share):
+    shutter = found(share, {k: v / 3 for k, v in SPEEDS.items()})
+    assert shutter is not None and shutter.share_std < 0.1 + 0.2 * (share == 0)
+    assert shutter.share == pytest.approx(share, abs=0.1)
 
 
 def test_nothing_is_said_of_a_camera_that_moves_alike_or_hardly():
