@@ -47,6 +47,7 @@ def test_a_scene_that_shows_between_moving_things_is_found(seed, monkeypatch):
     assert corner_error_px(fit.H_dst_src, TURNED) < 1.0
     monkeypatch.setattr(pair, "_of_minority", lambda source, target, prepared, best, options: (best, 0))
     monkeypatch.setattr(pair, "_of_faint_matches", lambda source, target, prepared, best, options: best)
+    monkeypatch.setattr(pair, "_unbent", lambda source, target, prepared, best, levels, options: best)
     before = register(a, b)
     assert not before.usable or corner_error_px(before.H_dst_src, TURNED) > 5.0
 
