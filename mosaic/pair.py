@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mosaic.bent import other_motions
-from mosaic.blur import matched, spread_difference
+from mosaic.blur import equally_sharp
 from mosaic.coded import blockiness
 from mosaic.coords import level_matrix, level_scale, normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
@@ -207,8 +207,7 @@ def _equally_sharp(
     """The fit, or the better one of the pictures made equally sharp."""
     if not best.usable:
         return best
-    difference = spread_difference(source, target, best.H_dst_src, best.gain, best.offset)
-    equal = None if difference is None else matched(source, target, difference, best.H_dst_src)
+    equal = equally_sharp(source, target, best.H_dst_src, best.gain, best.offset)
     if equal is None:
         return best
     again, _ = align(

@@ -160,7 +160,7 @@ def test_what_matches_hold_is_not_aligned_again_by_pixels(monkeypatch):
     source, target = _crowded(0, 0.55, TURNED)
     assert register(source, target).route == "matches"
     asked = []
-    monkeypatch.setattr(pair, "spread_difference", lambda *pictures: asked.append(pictures))
+    monkeypatch.setattr(pair, "equally_sharp", lambda *pictures: asked.append(pictures))
     assert register(source, target).route == "matches" and not asked
     register(*(as_uint8(picture(0, M), noise=2, seed=3) for M in (None, TURNED)))
     assert len(asked) == 1
