@@ -26,7 +26,7 @@ from mosaic.template import PreparedTemplate, mask_arguments
 from mosaic.verdict import alignment_score, pixel_information, regional_evidence
 from mosaic.warp import WarpFamily
 
-__all__ = ["RegisterOptions", "align", "cost_at", "judge_minority", "settle"]
+__all__ = ["RegisterOptions", "align", "cost_at", "costs_around", "judge_minority", "settle"]
 
 
 def align(
@@ -233,6 +233,29 @@ def cost_at(
     pair.gain, pair.offset = _gain(pair, state)
     residual = pair.evaluate(state).residual
     return float(pair.kernel.tukey_cost(residual, grey)), float(pair.kernel.inlier_scale(residual, grey))
+
+
+def costs_around(
+    source: PreparedTemplate,
+    target: Pyramid,
+    state: Any,
+    shifts_px: FloatArray,
+    *,
+    level: int,
+    grey: float,
+    n_pixels: int,
+    options: RegisterOptions,
+) -> FloatArray:
+    """Tukey's cost 0..1 at the deviation grey, of some n_pixels of a level, at a state and each of shifts (k, 2)."""
+    pair = _pair(source, target, level, options)
+    gain, offset = _gain(pair, state)
+    pixels = pair.pixels
+    stride = max(1, len(pixels.values) // n_pixels)
+    where, _, _ = source.family.warp(state, source.prepared[level])
+    residuals = pair.kernel.shifted_residuals(
+        *pair.picture, where, shifts_px, stride, pixels.values, gain, offset, *pair.masks
+    ).reshape(len(shifts_px), -1)
+    return np.array([pair.kernel.tukey_cost(some, grey) for some in residuals])
 
 
 def judge_minority(

@@ -16,13 +16,14 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mosaic.blur import matched, spread_difference
+from mosaic.bent import other_motions
+from mosaic.blur import equally_sharp
 from mosaic.coded import blockiness
 from mosaic.coords import level_matrix, level_scale, normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
 from mosaic.gray import as_gray, as_mask, as_planes, white_of
 from mosaic.kernels import KernelName
-from mosaic.minority import CLEARLY_MORE, agreement, best_minority, of_matches
+from mosaic.minority import AGREE_GREY, CLEARLY_MORE, HELD, agreement, best_minority, of_matches
 from mosaic.pyramid import Pyramid, build_pyramid, n_levels_for
 from mosaic.records import PAIR_REASONS, FloatArray, PairFit, PairStatus
 from mosaic.rescue import (
@@ -34,12 +35,13 @@ from mosaic.rescue import (
 )
 from mosaic.rivals import shift_starts
 from mosaic.template import PreparedTemplate, SelectionOptions, build_template, prepare
-from mosaic.turning import held
+from mosaic.turning import IMPOSSIBLE, contradiction, held, nearest_turn
 from mosaic.warp import HomographyFamily
 
 REASONS = {
     **PAIR_REASONS,
     "asymmetric": "the pictures the other way round give another homography",
+    "bent": "no camera that turns and zooms makes this homography, and a part of the picture does not agree with it",
     "inconsistent": "too many parts of the picture were found elsewhere than the homography puts them",
     "minority": "only a minority of the pixels agree, though in regions all over the overlap or with many features",
     "uncertain": "the pixels leave the homography open: the stated error of its anchors is large",
@@ -70,7 +72,8 @@ class PairOptions:
     cells, px of a, before the pair is weak; None: not checked. The score alone passes pairs in which most of the strong
     gradients belong to things that move by themselves.
     turning: hold what the pixels leave open by what a camera does that turns and zooms about the middle of its picture
-    (turning.py): a pull, not a wall; off to leave all eight parameters to the pixels.
+    (turning.py): a pull, not a wall; where it cannot be what a camera does and a part of the picture disagrees too,
+    look for another motion (bent.py), else say `bent`. Off to leave all eight parameters to the pixels.
     cell_px, max_away: a pair is weak where more than that share of the cells was found farther than cell_px from where
     the homography puts them; max_std_px: or where the anchors' stated error is larger. sure_score, sure_away,
     sure_std_px: when no other start is tried; else the best of all starts is taken, by status and score (measured on
@@ -119,8 +122,8 @@ def register(
 
     Returns PairFit with src = 0 (a), dst = 1 (b): H_dst_src maps px of a into b, det 1, NaN when failed. reason: a
     code of REASONS. route says which start it came from: 'start', 'identity', 'phase correlation', 'features',
-    'fine features', 'shift', 'minority' or 'matches' (minority.py), with ', blur matched' behind it where that was
-    done; n_steps counts all that were tried.
+    'fine features', 'shift', 'minority' or 'matches' (minority.py), 'other motion' (bent.py), with ', blur matched'
+    behind it where that was done; n_steps counts all that were tried.
     Raises ValueError or TypeError for pictures, masks or a start of the wrong shape, type or value.
     """
     options = options or PairOptions()
@@ -156,10 +159,46 @@ def register_pyramids(
     # A coarse level too poor to align on is passed over; on the finest level the estimator itself says no_texture.
     levels = [i for i in range(len(template.levels) - 1, 0, -1) if _n_pixels(prepared, i) >= enough] + [0]
     best = _best_of_starts(source, target, prepared, levels, start, options)
+    if options.turning and options.rescue:
+        best = _unbent(source, target, prepared, best, levels, options)
     # What no pixels hold they would spoil once more (two of 45 pairs with 40 % players: .2 and .3 px became 20 and 19).
     if options.match_blur and best.route != "matches":
         best = _equally_sharp(source, target, best, levels, options)
     return _held(best, source, target, options) if options.turning else best
+
+
+def _unbent(
+    source: Pyramid,
+    target: Pyramid,
+    prepared: PreparedTemplate,
+    best: PairFit,
+    levels: list[int],
+    options: PairOptions,
+) -> PairFit:
+    """The best fit or, where no camera makes its homography, one that a camera makes and that pixels agree with too.
+
+    Both end as the pixels leave them, free: what only the nearest turn has, they lead back.
+    """
+    sizes = source.size_px, target.size_px
+    if not contradiction(best, *sizes) > IMPOSSIBLE:
+        return best
+    turn = nearest_turn(best, *sizes)
+    if turn is None:
+        return best
+    found: list[PairFit] = []
+    n_steps = best.n_steps
+    for fit in other_motions(prepared, target, turn, levels=tuple(levels), options=options.estimator):
+        n_steps += fit.n_steps
+        if fit.usable and not contradiction(fit, *sizes) > IMPOSSIBLE:
+            found.append(_judged(fit, options))
+    if not found:
+        return replace(best, n_steps=n_steps)
+    agreed = [agreement(prepared, target, f, AGREE_GREY, options.estimator) for f in (*found, best)]
+    most = int(np.argmax(agreed[:-1]))
+    if not HELD * agreed[most] > agreed[-1]:
+        return replace(best, n_steps=n_steps)
+    fit, steps = _both_ways(found[most], _reverse(source, target, options), source, options)
+    return replace(fit, n_steps=n_steps + steps)
 
 
 def _equally_sharp(
@@ -168,8 +207,7 @@ def _equally_sharp(
     """The fit, or the better one of the pictures made equally sharp."""
     if not best.usable:
         return best
-    difference = spread_difference(source, target, best.H_dst_src, best.gain, best.offset)
-    equal = None if difference is None else matched(source, target, difference, best.H_dst_src)
+    equal = equally_sharp(source, target, best.H_dst_src, best.gain, best.offset)
     if equal is None:
         return best
     again, _ = align(
@@ -182,11 +220,19 @@ def _equally_sharp(
 
 
 def _held(fit: PairFit, source: Pyramid, target: Pyramid, options: PairOptions) -> PairFit:
-    """The fit with what turning cameras do; no longer `uncertain` where that was all that spoke against it."""
-    fit = held(fit, source.size_px, target.size_px)
-    if fit.reason != "uncertain":
-        return fit
-    return _judged(replace(fit, status=PairStatus.OK, reason=""), options)
+    """The fit with what turning cameras do; no longer `uncertain` where that was all that spoke against it.
+
+    Weak where no camera makes it and not all of the picture agrees with it: two motions bend a homography, whereas a
+    plane that another camera saw agrees with its own everywhere.
+    """
+    sizes = source.size_px, target.size_px
+    bent = contradiction(fit, *sizes) > IMPOSSIBLE and not _is_sure(fit, options)
+    fit = held(fit, *sizes)
+    if fit.reason == "uncertain":
+        fit = _judged(replace(fit, status=PairStatus.OK, reason=""), options)
+    return (
+        replace(fit, status=PairStatus.WEAK, reason="bent") if bent and fit.status == PairStatus.OK else fit
+    )
 
 
 def _best_of_starts(
@@ -210,10 +256,7 @@ def _best_of_starts(
             alone = fit.info
             if fit.usable and options.symmetric_px is not None:
                 if reverse is None:
-                    reverse = prepare(
-                        build_template(target, 1, options=options.selection),
-                        HomographyFamily(size_px=source.size_px),
-                    )
+                    reverse = _reverse(source, target, options)
                 fit, steps = _both_ways(fit, reverse, source, options)
                 n_steps += steps
             if best is None or _order(fit) < _order(best):
@@ -263,10 +306,7 @@ def _of_minority(
         return best, steps
     found = _judged(found, options)
     if options.symmetric_px is not None:
-        reverse = prepare(
-            build_template(target, 1, options=options.selection), HomographyFamily(size_px=source.size_px)
-        )
-        found, more = _both_ways(found, reverse, source, options)
+        found, more = _both_ways(found, _reverse(source, target, options), source, options)
         steps += more
     now, then = (agreement(prepared, target, f, grey, options.estimator) for f in (found, best))
     clearly = CLEARLY_MORE if _RANK[found.status] > _RANK[best.status] else 1.0
@@ -357,6 +397,13 @@ def _both_ways(
     if back.usable and np.sqrt(np.mean(np.sum(away**2, axis=1))) <= options.symmetric_px * _scale_px(fit):
         return fit, back.n_steps
     return replace(fit, status=PairStatus.WEAK, reason="asymmetric"), back.n_steps
+
+
+def _reverse(source: Pyramid, target: Pyramid, options: PairOptions) -> PreparedTemplate:
+    """The second picture as the template, for the way back."""
+    return prepare(
+        build_template(target, 1, options=options.selection), HomographyFamily(size_px=source.size_px)
+    )
 
 
 def _order(fit: PairFit) -> tuple[int, float]:

@@ -47,6 +47,7 @@ def test_a_scene_that_shows_between_moving_things_is_found(seed, monkeypatch):
     assert corner_error_px(fit.H_dst_src, TURNED) < 1.0
     monkeypatch.setattr(pair, "_of_minority", lambda source, target, prepared, best, options: (best, 0))
     monkeypatch.setattr(pair, "_of_faint_matches", lambda source, target, prepared, best, options: best)
+    monkeypatch.setattr(pair, "_unbent", lambda source, target, prepared, best, levels, options: best)
     before = register(a, b)
     assert not before.usable or corner_error_px(before.H_dst_src, TURNED) > 5.0
 
@@ -159,7 +160,7 @@ def test_what_matches_hold_is_not_aligned_again_by_pixels(monkeypatch):
     source, target = _crowded(0, 0.55, TURNED)
     assert register(source, target).route == "matches"
     asked = []
-    monkeypatch.setattr(pair, "spread_difference", lambda *pictures: asked.append(pictures))
+    monkeypatch.setattr(pair, "equally_sharp", lambda *pictures: asked.append(pictures))
     assert register(source, target).route == "matches" and not asked
     register(*(as_uint8(picture(0, M), noise=2, seed=3) for M in (None, TURNED)))
     assert len(asked) == 1

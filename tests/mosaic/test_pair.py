@@ -209,7 +209,7 @@ def test_the_scene_is_found_beside_a_board_that_runs_and_has_most_of_the_gradien
     a = as_uint8(_board_over_weak_ground(seed, None, 0.0), noise=2, seed=1)
     b = as_uint8(_board_over_weak_ground(seed, H, runs_px), noise=2, seed=2)
     fit = register(a, b)
-    assert fit.status == PairStatus.OK and fit.route in ("shift", "minority")
+    assert fit.status == PairStatus.OK and fit.route.split(", ")[0] in ("shift", "minority")
     assert corner_error_px(fit.H_dst_src, H) < 0.5
 
 

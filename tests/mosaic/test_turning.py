@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from mosaic.coords import default_anchors, normalise_homography, transfer
 from mosaic.pair import PairOptions, register
 from mosaic.records import FlowGrid, PairFit, PairStatus
-from mosaic.turning import LIKELY, held
+from mosaic.turning import IMPOSSIBLE, LIKELY, contradiction, held, nearest_turn
 from tests.mosaic.textures import as_uint8, corner_error_px, homography, picture
 
 SIZE = (1280, 720)
@@ -127,6 +127,30 @@ def test_what_no_turning_camera_does_is_left_to_the_pixels():
     now = held(fit, SIZE, SIZE)
     assert corner_error_px(now.H_dst_src, H, SIZE) < 0.02
     assert np.trace(now.info) < 1.02 * np.trace(fit.info)
+
+
+def test_cameras_are_contradicted_as_chance_has_it_and_a_shear_far_beyond():
+    rng = np.random.default_rng(8)
+    found = []
+    for _ in range(200):
+        fit = _measured(_drawn(rng), _loose(rng, 5.0), rng)
+        found.append(contradiction(fit, SIZE, SIZE))
+    # Chi-square of three, the focal length being open, up to four; and a lens is allowed for that they do not have.
+    assert 2.0 < np.mean(found) < 4.5 and max(found) < IMPOSSIBLE
+    shear = _camera(1.0) @ np.array([[1, 0.01, 0], [0.01, 1, 0], [0, 0, 1.0]]) @ np.linalg.inv(_camera(1.0))
+    assert contradiction(_fit(shear, np.eye(8) / 0.1**2), SIZE, SIZE) > 2 * IMPOSSIBLE
+    assert contradiction(_fit(shear, np.zeros((8, 8))), SIZE, SIZE) == 0.0
+
+
+def test_the_nearest_turn_has_no_shear_and_a_camera_is_its_own():
+    turned = _turned(3.0, 1.1, 0.3, 0.1, 0.05)
+    info = np.eye(8) / 0.1**2
+    own = nearest_turn(_fit(turned, info), SIZE, SIZE)
+    assert own is not None and corner_error_px(own, turned, SIZE) < 0.5
+    shear = _camera(1.0) @ np.array([[1, 0.01, 0], [0.01, 1, 0], [0, 0, 1.0]]) @ np.linalg.inv(_camera(1.0))
+    near = nearest_turn(_fit(shear @ turned, info), SIZE, SIZE)
+    assert near is not None and contradiction(_fit(near, info), SIZE, SIZE) < 0.5
+    assert corner_error_px(near, shear @ turned, SIZE) < 10.0
 
 
 def test_a_loose_pair_that_no_turning_camera_made_is_moved_by_about_its_stated_error():
