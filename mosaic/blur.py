@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mosaic.coords import level_matrix, transfer
 from mosaic.photometric import TUKEY
 from mosaic.pyramid import Pyramid, build_pyramid
 from mosaic.records import FloatArray
@@ -48,9 +49,8 @@ def spread_difference(
     the part that is looked at, px of the level, in the middle of what both see; None: all.
     """
     index = min(level, len(a.levels) - 1, len(b.levels) - 1)
-    (ax, ay), (bx, by) = a.scales[index], b.scales[index]
-    up = np.array([[ax, 0, (ax - 1) / 2], [0, ay, (ay - 1) / 2], [0, 0, 1.0]])
-    down = np.linalg.inv(np.array([[bx, 0, (bx - 1) / 2], [0, by, (by - 1) / 2], [0, 0, 1.0]]))
+    ax, ay = a.scales[index]
+    up, down = level_matrix(a.scales[index]), np.linalg.inv(level_matrix(b.scales[index]))
     first: Any = np.asarray(a.levels[index], np.float32)
     second: Any = np.asarray(b.levels[index], np.float32) * np.float32(gain) + np.float32(offset)
     H = down @ H_b_a @ up
@@ -98,8 +98,8 @@ def _middle_of_both(
 ) -> tuple[int, int]:
     """Corner x, y of a square about the middle of what a picture (h, w) and another one see, inside the first."""
     (h, w), (other_h, other_w) = shape, other
-    p = np.linalg.inv(H_other) @ np.array([(other_w - 1) / 2, (other_h - 1) / 2, 1.0])
-    x, y = ((p[:2] / p[2] + [(w - 1) / 2, (h - 1) / 2]) / 2 - side / 2).round().astype(int)
+    own, its = np.array([w - 1.0, h - 1.0]) / 2, np.array([other_w - 1.0, other_h - 1.0]) / 2
+    x, y = ((own + transfer(np.linalg.inv(H_other), its)) / 2 - side / 2).round().astype(int)
     return int(np.clip(x, 0, max(w - side, 0))), int(np.clip(y, 0, max(h - side, 0)))
 
 

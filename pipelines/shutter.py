@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.linear import weighted_median
-from mosaic.blur import spread_difference
+from mosaic.blur import COARSE, spread_difference
 from mosaic.coords import transfer
 from mosaic.pyramid import Pyramid
 from mosaic.records import PairFit
@@ -29,10 +30,9 @@ if TYPE_CHECKING:
     from pipelines.keyframe_graph import KeyframePictures  # which holds a Shutter itself
 
 MOST_PAIRS = 40  # looked at: those that tell most
-# Of difference, were the shutter always open. A difference is found to about 2 px^2 (mosaic/blur.py).
-LEAST_PX2, SPREAD_PX2 = 2.0, 2.0
-# On the two finer levels: to what a difference is found there, and the largest one that is small enough for them, px^2.
-FINE_SPREAD_PX2, FINE_MOST_PX2 = (0.25, 0.6), (1.0, 5.0)
+LEAST_PX2 = 2.0  # of difference, were the shutter always open
+SPREAD_PX2 = (0.25, 0.6, 2.0)  # to what a difference is found on each level of a pyramid (mosaic/blur.py)
+FINE_MOST_PX2 = (1.0, 5.0)  # the largest difference that is small enough for the two finer levels
 FINE_STD = 0.02  # of the share's square: where it is known less well, the finer levels are asked
 FINE_LARGEST = 0.3  # the largest square that is looked for there where the reduced pictures say nothing
 FINE_PX = 512  # side of the part of a picture that is looked at
@@ -72,20 +72,17 @@ def find_shutter(
             continue
         v, w = speed[fit.dst], speed[fit.src]
         sights.append(_Sight(fit, (np.outer(v, v) - np.outer(w, w)) / 12))
-    known: dict[int, Pyramid] = {}
 
+    @cache
     def pyramid(frame: int) -> Pyramid:
-        if frame not in known:
-            known[frame] = pictures.pyramid(frame, n_levels, mask)
-        return known[frame]
+        return pictures.pyramid(frame, n_levels, mask)
 
-    coarse = _measured([(s, 2) for s in sights if s.size >= LEAST_PX2], pyramid)
+    coarse = _measured([(s, COARSE) for s in sights if s.size >= LEAST_PX2], pyramid)
     if coarse is not None and coarse.std <= FINE_STD:
         return coarse.shutter()
     most = FINE_LARGEST if coarse is None else min(coarse.square + 3 * coarse.std, FINE_LARGEST)
-    levels = [(s, next((k for k in (0, 1) if s.size * most <= FINE_MOST_PX2[k]), 2)) for s in sights]
-    told = [(s, level) for s, level in levels if level < 2 and s.size >= FINE_SPREAD_PX2[level]]
-    fine = _measured(told, pyramid)
+    levels = [(s, next((k for k in (0, 1) if s.size * most <= FINE_MOST_PX2[k]), COARSE)) for s in sights]
+    fine = _measured([(s, k) for s, k in levels if k < COARSE and s.size >= SPREAD_PX2[k]], pyramid)
     if fine is not None and fine.square <= most and (coarse is None or fine.std < coarse.std):
         return fine.shutter()
     return None if coarse is None else coarse.shutter()
@@ -124,7 +121,7 @@ def _measured(sights: Sequence[tuple[_Sight, int]], pyramid: Callable[[int], Pyr
     """What these pairs show, each on its level; None: nothing."""
 
     def telling(one: tuple[_Sight, int]) -> float:
-        return one[0].size / (*FINE_SPREAD_PX2, SPREAD_PX2)[one[1]]
+        return one[0].size / SPREAD_PX2[one[1]]
 
     ordered = sorted(sights, key=lambda one: (-telling(one), one[0].fit.src, one[0].fit.dst))
     ratios, weights = [], []
@@ -132,11 +129,11 @@ def _measured(sights: Sequence[tuple[_Sight, int]], pyramid: Callable[[int], Pyr
         fit, open_px2 = sight.fit, sight.open_px2
         spread = spread_difference(
             pyramid(fit.src), pyramid(fit.dst), fit.H_dst_src, fit.gain, fit.offset,
-            level=level, most_px=None if level == 2 else FINE_PX,
+            level=level, most_px=None if level == COARSE else FINE_PX,
         )  # fmt: skip
         if spread is None:
             continue
-        if level < 2:
+        if level < COARSE:
             # The lens and the coder blur all directions alike, and not every frame as much.
             spread, open_px2 = _one_sided(spread), _one_sided(open_px2)
         ratios.append(float((spread * open_px2).sum() / (open_px2**2).sum()))
