@@ -357,7 +357,7 @@ def _judge(
 def _warp_homography(src: FloatArray, dst: FloatArray) -> FloatArray:
     """The homography closest to the family's own warp, from some of its points: start of the fit to the flow."""
     good = np.flatnonzero(np.isfinite(dst).all(axis=1))
-    some = good[:: max(1, len(good) // 64)]
+    some = good[:: max(1, len(good) // 24)]
     H, _ = cv2.findHomography(src[some], dst[some], 0)
     return np.eye(3) if H is None else np.asarray(H, np.float64)
 

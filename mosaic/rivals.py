@@ -119,7 +119,7 @@ def better_of_rivals(
             continue
         same_place = False
         if fit.usable:
-            moved_px = np.nanmedian(source.family.warp(state, source.prepared_wide)[0] - still, axis=0)
+            moved_px = _median_step(source.family.warp(state, source.prepared_wide)[0] - still)
             same_place = bool(np.abs(moved_px - shift).max() <= SAME_PLACE * target.scales[swept][0])
             if same_place and fit.score < BENT_SCORE:
                 continue
@@ -158,6 +158,14 @@ def shifted(family: WarpFamily, state: Any, prepared: Any, shift_px: FloatArray)
     """The state of any family that moves the prepared points nearest to where `state` does, plus the shift (2,) px."""
     where, _, _ = family.warp(state, prepared)
     return nearest_state(family, state, prepared, where + shift_px)
+
+
+def _median_step(steps_px: FloatArray) -> FloatArray:
+    """The median (2,) of steps (n, 2) px, of which some are NaN; NaN where all are."""
+    known = steps_px[
+        np.isfinite(steps_px).all(axis=1)
+    ]  # of so few np.nanmedian makes a masked array, 30 times as long
+    return np.asarray(np.median(known, axis=0)) if len(known) else np.full(2, np.nan)
 
 
 def _placed(

@@ -512,34 +512,30 @@ class _Outlines:
         self._placements, self._surface = placements, surface
         self._step = max(surface.width, surface.height) / COVER_CELLS
         self.shape = (int(np.ceil(surface.height / self._step)), int(np.ceil(surface.width / self._step)))
-        self._cells: dict[int, NDArray[np.uint8]] = {}  # as bits: 10 kB each
+        self._bits: dict[int, NDArray[np.uint8]] = {}  # 10 kB each
 
     def __len__(self) -> int:
         return len(self._placements)
 
-    def __getitem__(self, i: int) -> NDArray[np.intp]:
-        """Flat numbers of the cells that the i-th placement covers, ascending."""
-        if i not in self._cells:
+    def bits(self, i: int) -> NDArray[np.uint8]:
+        """The cells that the i-th placement covers, row by row, packed."""
+        if i not in self._bits:
             own = np.zeros(self.shape, np.uint8)
             _draw_outline(own, self._placements[i], self._surface, self._step)
-            self._cells[i] = np.packbits(own)
-        return np.flatnonzero(np.unpackbits(self._cells[i]))
+            self._bits[i] = np.packbits(own)
+        return self._bits[i]
 
 
 def _cover_rest(outlines: _Outlines, chosen: Sequence[int], limit: int) -> list[int]:
     """Further placements, `limit` at most, that see what none of the chosen ones does: strips between lattice points,
     and what only a coarse or blurred frame reaches."""
-    open_cells = np.ones(outlines.shape[0] * outlines.shape[1], bool)
-    for i in chosen:
-        open_cells[outlines[i]] = False
-    taken = set(chosen)
+    missed = ~np.bitwise_or.reduce([outlines.bits(i) for i in chosen])
     gains: list[tuple[int, NDArray[np.intp]]] = []
-    for i in range(len(outlines)):
-        if i not in taken:
-            new = outlines[i]
-            new = new[open_cells[new]]
-            if len(new):
-                gains.append((i, new))
+    for i in sorted(set(range(len(outlines))) - set(chosen)):
+        new = outlines.bits(i) & missed
+        if new.any():
+            gains.append((i, np.flatnonzero(np.unpackbits(new))))
+    open_cells = np.unpackbits(missed).view(bool)
     added: list[int] = []
     while gains and len(added) < limit:
         counts = [int(open_cells[cells].sum()) for _, cells in gains]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib import rotation
+from calib.distortion import fold_square
 from calib.parallax import Parallax
 from calib.records import HomographyEdge, HomographyGraph, Lens, Solution
 from calib.rolling_shutter import frame_rates, row_delay
@@ -77,6 +78,24 @@ def _source_rays(points, f, aspect, k, pp_x, pp_y, half_width):  # type: ignore[
         B[i, 1, 0] = -d01 / det * aspect / f
         B[i, 1, 1] = d00 / det * aspect / f
     return rays, B
+
+
+@nb.njit(cache=True, nogil=True)
+def _projected(axes, fx, fy, k1, k2, pp_x, pp_y, half_width, fold2):  # type: ignore[no-untyped-def]
+    """Camera axes (n, 3) to raw px (n, 2); NaN behind the camera and where the model folds, from fold2 on.
+
+    The compiled twin of calib.distortion.distort (a test holds them together): the compositor asks for every tile.
+    """
+    out = np.empty((len(axes), 2))
+    for i in range(len(axes)):
+        depth = axes[i, 2]
+        x, y = np.nan, np.nan
+        if depth > 1e-6:
+            x, y = fx * axes[i, 0] / depth, fy * axes[i, 1] / depth
+        r2 = (x * x + y * y) / (half_width * half_width)
+        bend = 1.0 + r2 * (k1 + k2 * r2) if r2 < fold2 else np.nan
+        out[i, 0], out[i, 1] = pp_x + x * bend, pp_y + y * bend
+    return out
 
 
 @nb.njit(cache=True, nogil=True)
@@ -373,9 +392,13 @@ class CameraPlacement:
 
     def _project(self, axes: FloatArray, f: float) -> FloatArray:
         """Camera axes (..., 3) at focal f to raw px."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            q = np.where(axes[..., 2:] > 1e-6, axes[..., :2] / axes[..., 2:], np.nan)
-        return self.lens.distort(self.lens.pp_px + q * np.array([f, f / self.lens.aspect]), self.pose.log_f)
+        lens = self.lens
+        k1 = float(lens.k1_half(self.pose.log_f))
+        raw = _projected(
+            np.ascontiguousarray(axes.reshape(-1, 3)), float(f), float(f / lens.aspect), k1, float(lens.k2),
+            float(lens.pp_px[0]), float(lens.pp_px[1]), lens.size_px[0] / 2.0, float(fold_square(k1, lens.k2)),
+        )  # fmt: skip
+        return np.asarray(raw.reshape(*axes.shape[:-1], 2))
 
     def _late(self, y_px: FloatArray) -> FloatArray:
         """By how much of a frame's time (...) the row at y_px was read after the middle one; half a picture beyond the

@@ -71,14 +71,34 @@ class EditFound:
     kind: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EditPicture:
+    """What edits are found by: a picture of SIZE, its details of a middling size (both float32, grey), and how much
+    contrast it and these have (grey)."""
+
+    low: FloatImage
+    band: FloatImage
+    contrast: float
+    fine_contrast: float
+
+
+def edit_picture(gray: NDArray[np.generic]) -> EditPicture:
+    """Of a gray picture (h, w), 0..255, any size. It knows nothing of other frames: any thread may make it."""
+    small = np.asarray(
+        cv2.resize(np.asarray(gray, np.float32), SIZE, interpolation=cv2.INTER_AREA), np.float32
+    )
+    band = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.5) - cv2.GaussianBlur(small, (0, 0), 8), np.float32)
+    return EditPicture(
+        low=small, band=band, contrast=float(small.std()),
+        fine_contrast=float(np.sqrt(_blocks(band * band)).mean()),
+    )  # fmt: skip
+
+
 @dataclass(slots=True, eq=False)
 class _Seen:
     frame: int
-    low: FloatImage
-    band: FloatImage
+    picture: EditPicture
     to_now: NDArray[np.float64]  # motion since some frame before or among those kept, small px
-    contrast: float
-    fine_contrast: float
     own: float = float("nan")  # share of blocks kept over LAG frames up to this one
     change: FloatImage | None = (
         None  # since the picture before, that motion does not explain; see EditFinder._change
@@ -97,27 +117,15 @@ class EditFinder:
         self._begun: int | None = None  # last frame of the old view in an edit that has not ended yet
         self._begun_at = 0
 
-    def push(
-        self, frame: int, picture: NDArray[np.generic], H_step: NDArray[np.float64] | None
-    ) -> EditFound | None:
-        """picture: (h, w) gray 0..255, any size. H_step: (3, 3) full px from the frame before; None: not registered."""
-        gray = np.asarray(picture, np.float32)
-        small = np.asarray(cv2.resize(gray, SIZE, interpolation=cv2.INTER_AREA), np.float32)
+    def push(self, frame: int, picture: EditPicture, H_step: NDArray[np.float64] | None) -> EditFound | None:
+        """H_step: (3, 3) full px from the frame before; None: not registered."""
         H = np.eye(3)
         if H_step is not None and np.isfinite(H_step).all():
             H = self._down @ H_step @ self._up
         if self._seen:
             H = H @ self._seen[-1].to_now
             H /= np.cbrt(np.linalg.det(H)) if np.linalg.det(H) > 0 else 1.0
-        fine = cv2.GaussianBlur(small, (0, 0), 1.5)
-        broad = cv2.GaussianBlur(small, (0, 0), 8)
-        band = fine - broad
-        self._seen.append(
-            _Seen(
-                frame=frame, low=small, band=band, to_now=H, contrast=float(small.std()),
-                fine_contrast=float(np.sqrt(_blocks(band * band)).mean()),
-            )
-        )  # fmt: skip
+        self._seen.append(_Seen(frame=frame, picture=picture, to_now=H))
         n = len(self._seen)
         own = self._left(n - 1 - LAG, n - 1) if n > LAG else float("nan")
         self._seen[-1].own = own
@@ -237,8 +245,8 @@ class EditFinder:
 
     def _left(self, j: int, i: int, *, moved: bool = True) -> float:
         """Share of blocks of the i-th picture that the j-th shows as well; NaN where they hardly overlap."""
-        b = self._seen[i].band
-        a = self._seen[j].band
+        b = self._seen[i].picture.band
+        a = self._seen[j].picture.band
         if moved:
             a = np.asarray(cv2.warpPerspective(a, self._between(j, i), SIZE, borderValue=-999.0), np.float32)
             inside = (a > -500.0).astype(np.float32)
@@ -255,9 +263,9 @@ class EditFinder:
         return float((ab[told] > ALIKE * np.sqrt(aa[told] * bb[told] + 1e-6)).mean())
 
     def _looks_like_before(self, j: int, i: int) -> bool:
-        b = _blurred(self._seen[i].low)
+        b = _blurred(self._seen[i].picture.low)
         for H in (self._between(j, i), np.eye(3)):
-            a = cv2.warpPerspective(self._seen[j].low, H, SIZE, borderValue=-999.0)
+            a = cv2.warpPerspective(self._seen[j].picture.low, H, SIZE, borderValue=-999.0)
             inside = _blurred(np.where(a < -500.0, np.float32(-1e6), 0.0).astype(np.float32)) > -1.0
             if inside.sum() < 100:
                 continue
@@ -270,14 +278,14 @@ class EditFinder:
     def _darkest(self, j: int, i: int) -> int | None:
         """The picture around an edit that has least contrast, if that is a fade's; None: there is no fade."""
         begin, end = self._first_kept(), len(self._seen) - 1
-        contrast = [s.contrast for s in self._seen]
+        contrast = [s.picture.contrast for s in self._seen]
         k = min(range(max(begin, j - 6), min(end, i + 6) + 1), key=contrast.__getitem__)
         sides = max(contrast[begin : k + 1], default=0.0), max(contrast[k : end + 1], default=0.0)
         return k if contrast[k] < DARK * min(sides) else None
 
     def _contrast_left(self, last: int, first: int) -> float:
         """Least fine contrast within an edit (over three frames) against that of its ends; 1 where it is too short."""
-        fine = [s.fine_contrast for s in self._seen]
+        fine = [s.picture.fine_contrast for s in self._seen]
         begin, end = max(self._first_kept(), last - 4), min(first + 4, len(self._seen) - 1)
         old, new = np.median(fine[begin : last + 1]), np.median(fine[first : end + 1])
         if first - last < 4:
@@ -289,7 +297,7 @@ class EditFinder:
     def _fade(self, k: int) -> tuple[int, int]:
         """Last picture of full contrast before the k-th and first one after it."""
         begin, end = self._first_kept(), len(self._seen) - 1
-        contrast = [s.contrast for s in self._seen]
+        contrast = [s.picture.contrast for s in self._seen]
         last, first = k, k
         least = 0.005 * max(contrast)
         # Two steps at once: the darkest picture may come twice.
@@ -315,13 +323,13 @@ class EditFinder:
         seen = self._seen[k]
         if seen.change is None:
             before = cv2.warpPerspective(
-                self._seen[k - 1].low, self._between(k - 1, k), SIZE, borderMode=cv2.BORDER_REPLICATE
+                self._seen[k - 1].picture.low, self._between(k - 1, k), SIZE, borderMode=cv2.BORDER_REPLICATE
             )
-            seen.change = _blurred(seen.low - before)
+            seen.change = _blurred(seen.picture.low - before)
         return seen.change
 
     def _way(self, last: int, first: int) -> FloatImage:
-        old, new = _blurred(self._seen[last].low), _blurred(self._seen[first].low)
+        old, new = _blurred(self._seen[last].picture.low), _blurred(self._seen[first].picture.low)
         return np.asarray(new - new.mean() - (old - old.mean()), np.float32)
 
     def _progress(self, last: int, first: int) -> tuple[float, float]:

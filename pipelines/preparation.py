@@ -1,4 +1,5 @@
-"""What registration wants of a frame, made from its gray alone: pyramid, template, a small picture for a rescue.
+"""What the first pass wants of a frame, made from its gray alone: pyramid, template, small pictures for a rescue and
+for edits.
 
 It knows nothing of the frames before, so that the next frame is prepared in a thread while this one is registered.
 """
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from mosaic.pyramid import Pyramid, build_pyramid, quarter_mask
 from mosaic.rescue import small_gray
 from mosaic.template import SelectionOptions, Template, build_template
+from pipelines.edits import EditPicture, edit_picture
 from pipelines.errors import InputError
 from pipelines.overlays import both_masks
 
@@ -26,13 +28,15 @@ LEAST_SIDE_PX = 8  # two pixels at a quarter of the size, where graphics are loo
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreparedFrame:
     """A frame before registration. template: of the levels from `finest_of` on, for the frame after it; small: see
-    small_gray; scene: at a quarter of the size, 1 = none of the people that are known (None: nothing is known)."""
+    small_gray; edit: what cuts and dissolves are found by; scene: at a quarter of the size, 1 = none of the people that
+    are known (None: nothing is known)."""
 
     frame: int
     pts_s: float
     pyramid: Pyramid
     template: Template
     small: NDArray[np.uint8]
+    edit: EditPicture
     scene: NDArray[np.uint8] | None = None
 
     @property
@@ -77,11 +81,13 @@ def prepare_frame(
     frames; scene (h, w): True = no people in this one."""
     pyramid = build_pyramid(gray, n_levels=n_levels, mask=both_masks(mask, scene))
     levels = tuple(range(finest_of(pyramid.size_px), len(pyramid.levels)))
+    small = small_gray(pyramid)
     return PreparedFrame(
         frame=frame,
         pts_s=pts_s,
         pyramid=pyramid,
         template=build_template(pyramid, frame, options=selection, levels=levels),
-        small=small_gray(pyramid),
+        small=small,
+        edit=edit_picture(small),
         scene=None if scene is None else quarter_mask(scene),
     )

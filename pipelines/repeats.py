@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections import deque
 from typing import Any, cast
 
@@ -26,7 +27,7 @@ class Repeats:
         if before.dtype != picture.dtype:  # images of unlike depth in one folder
             before, picture = before.astype(np.float32), picture.astype(np.float32)
         change = float(cv2.norm(cast(Any, picture), cast(Any, before), cv2.NORM_L1)) / picture.size
-        usual = float(np.median(self._changes)) if len(self._changes) >= 3 else float("nan")
+        usual = statistics.median(self._changes) if len(self._changes) >= 3 else float("nan")
         if change < SAME_GREY or (change < NEARLY_SHARE * usual and change < NEARLY_GREY):
             return True
         self._changes.append(change)

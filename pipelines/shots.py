@@ -82,7 +82,7 @@ class ShotSplitter:
         assert self._newest is not None
         if self._edits is None:
             self._edits = EditFinder(self._newest.size_px)
-        found = self._edits.push(look.frame, look.small, _motion_of(self._newest, look.frame))
+        found = self._edits.push(look.frame, look.edit, _motion_of(self._newest, look.frame))
         assert self._current is not None
         if found is None:
             if self._ended is not None and look.frame - self._current.observations[0].frame >= WAIT:

@@ -108,6 +108,23 @@ def test_compiled_rays_equal_the_lens(k):
     np.testing.assert_allclose(ideal, lens.undistort(POINTS, src.log_f), atol=1e-7)
 
 
+@pytest.mark.parametrize(("k1", "k2"), [(0.06, 0.0), (0.0, 0.0), (-0.1, 0.0), (0.02, -0.01)])
+def test_compiled_projection_equals_the_lens(k1, k2):
+    lens = Lens(size_px=(1280, 720), pp_px=np.array([650.0, 350.0]), aspect=1.02, c0=k1, k2=k2)
+    pose = CameraPose(log_f=float(np.log(900.0)), R=rotation.exp([0.02, -0.1, 0.01]))
+    placement = CameraPlacement(frame=0, size_px=(1280, 720), lens=lens, pose=pose)
+    # All round: behind the camera, and beyond the radius where the two negative lenses fold.
+    angle = np.linspace(-np.pi, np.pi, 97)
+    rays = np.stack([np.sin(angle), 0.3 * np.cos(3 * angle), np.cos(angle)], axis=-1)
+    axes = rays @ pose.R.T
+    f = np.exp(pose.log_f)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ideal = lens.pp_px + np.array([f, f / lens.aspect]) * axes[:, :2] / axes[:, 2:]
+    expected = np.where(axes[:, 2:] > 1e-6, lens.distort(ideal, pose.log_f), np.nan)
+    np.testing.assert_allclose(placement.ray_to_pixel(rays), expected, rtol=1e-12)
+    assert 0 < np.isfinite(expected).sum() < expected.size
+
+
 def test_increment_is_a_left_rotation():
     _, _, _, family, state = family_and_state()
     step = np.array([0.01, 0.02, -0.03, 0.04])

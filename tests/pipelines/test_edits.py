@@ -12,7 +12,7 @@ from scipy import ndimage
 from benchmarks.edits import inside, matched
 from pipelines.config import Config
 from pipelines.decode import open_clip
-from pipelines.edits import MIXED_CONTRAST, EditFinder, EditFound
+from pipelines.edits import MIXED_CONTRAST, EditFinder, EditFound, edit_picture
 from pipelines.first_look import look_at
 from tests.pipelines.end_to_end import pan_spec
 from tests.synth.edits import Edit, Programme, blend, write_programme
@@ -46,7 +46,7 @@ def found(pictures: Pictures, step_px: float = 3.0) -> list[EditFound]:
     motion[0, 2] = -step_px
     edits = []
     for k, picture in enumerate(pictures):
-        edit = finder.push(k, picture, motion if k else None)
+        edit = finder.push(k, edit_picture(picture), motion if k else None)
         if edit is not None:
             finder.begin(edit.first)
             edits.append(edit)
@@ -125,7 +125,7 @@ def test_a_dissolve_loses_contrast_and_players_who_fill_the_picture_do_not(seed:
     for name, pictures in (("dissolve", dissolve), ("players", crowded(seed, 80))):
         finder = EditFinder((W, H))
         for k, picture in enumerate(pictures):
-            finder.push(k, picture, None)
+            finder.push(k, edit_picture(picture), None)
         left[name] = finder._contrast_left(29, 50)
     assert left["dissolve"] < MIXED_CONTRAST - 0.03 and left["players"] > MIXED_CONTRAST + 0.03
 

@@ -13,7 +13,7 @@ from benchmarks.memory import loop
 from mosaic.estimator import RegisterOptions
 from mosaic.records import PairStatus
 from pipelines.config import RegistrationOptions
-from pipelines.edits import EditFinder
+from pipelines.edits import EditFinder, edit_picture
 from pipelines.keyframes import Keyframe
 from pipelines.preparation import PreparedFrame, prepare_frame
 from pipelines.routes import Known, Motion, recover
@@ -67,7 +67,7 @@ def test_motion_over_a_long_clip_does_not_wear_out_the_edit_finder() -> None:
     views = [view(seed, n) for seed in (1, 2)]
     finder, found = EditFinder((W, H)), []
     for k in range(n * n_shots):
-        edit = finder.push(k, views[k // n % 2][k % n], pan if k % n else wrong)
+        edit = finder.push(k, edit_picture(views[k // n % 2][k % n]), pan if k % n else wrong)
         if edit is not None:
             finder.begin(edit.first)
             found.append((edit.last, edit.first))

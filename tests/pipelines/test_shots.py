@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+from pipelines.edits import edit_picture
 from pipelines.shots import ShotSplitter, TrackedShot
 from tests.mosaic.textures import as_uint8, picture
 
@@ -29,10 +30,10 @@ class _Tracker:
 
 def _frames_of_shots(n_frames: int, max_frames: int | None) -> list[tuple[list[int], str]]:
     splitter = ShotSplitter(_Tracker, bridge_frames=10, max_frames=max_frames)  # type: ignore[arg-type]
-    small = as_uint8(picture(1, size_px=(320, 180)))
+    edit = edit_picture(as_uint8(picture(1, size_px=(320, 180))))
     shots: list[TrackedShot] = []
     for frame in range(n_frames):
-        shots += splitter.push(SimpleNamespace(frame=frame, pts_s=frame / 25, small=small))  # type: ignore[arg-type]
+        shots += splitter.push(SimpleNamespace(frame=frame, pts_s=frame / 25, edit=edit))  # type: ignore[arg-type]
     shots += splitter.finish()
     return [([o.frame for o in shot.tracker.observations], shot.end) for shot in shots]
 
