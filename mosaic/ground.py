@@ -16,6 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mosaic.boards import MARGIN_PX, MOST_VIEWS, column_costs, cut_columns, find_boards
 from mosaic.motion import expand_map
 from mosaic.states import EVIDENCE_STEP, NEVER, REACH, find_states, no_states, settle
 from mosaic.surface import Placement, Surface
@@ -66,9 +67,9 @@ def decide(
     threads: int,
     *,
     together: bool = True,
-) -> tuple[Picture, NDArray[np.int16]]:
-    """The composite (h, w, 3) with the ground decided where it is contested (h, w); and at how many moments that colour
-    was seen there (h, w), 0 where nothing was decided.
+) -> tuple[Picture, NDArray[np.int16], NDArray[np.bool_]]:
+    """The composite (h, w, 3) with the ground decided where it is contested (h, w); at how many moments that colour
+    was seen there (h, w), 0 where nothing was decided; and where boards change (h, w), see boards.py.
 
     witnesses: in the order of time. surface: the one whose pixels the composite has. together: see CompositeOptions."""
     height, width = contested.shape
@@ -81,29 +82,68 @@ def decide(
         wider = np.s_[y : y + TILE_PX + REACH, x : x + TILE_PX + REACH]
         if not contested[wider].any():
             return
-        here = [w for w in witnesses if _meet(w.box, x, y)]
         part = states.part(x, y, TILE_PX)
-        if not here:
+        views, seen, frames = _sampled(witnesses, surface, x, y, contested[wider].shape)
+        if len(frames):
+            find_states(views, seen, frames, composite[wider], contested[wider], part)
+        else:
             part.value[:] = NEVER
-            return
-        shape = contested[wider].shape
-        views = np.zeros((len(here), *shape, 4), np.uint8)
-        seen = np.zeros((len(here), *shape), np.uint8)
-        rays = _rays(surface, x, y, shape)
-        for view, usable, witness in zip(views, seen, here, strict=True):
-            _sample(witness, rays, view, usable)
-        frames = np.array([w.placement.frame for w in here], np.int64)
-        find_states(views, seen, frames, composite[wider], contested[wider], part)
 
     with ThreadPoolExecutor(threads) as pool:
         for _ in pool.map(work, corners):
             pass
-    chosen = settle(states, contested) if together else np.zeros((height, width), np.uint8)
-    return states.picture(chosen, composite, contested)
+    if not together:
+        nothing = np.zeros((height, width), np.uint8)
+        return *states.picture(nothing, composite, contested), nothing > 0
+    image, moments = states.picture(settle(states, contested), composite, contested)
+    boards = find_boards(states.restless)
+    return in_whole_pieces(image, boards, witnesses, surface), moments, boards
 
 
-def _meet(box: tuple[float, float, float, float], x: int, y: int) -> bool:
-    return box[0] < x + TILE_PX + REACH and box[2] > x and box[1] < y + TILE_PX + REACH and box[3] > y
+def in_whole_pieces(
+    image: Picture, where: NDArray[np.bool_], witnesses: Sequence[Witness], surface: Surface
+) -> Picture:
+    """The picture (h, w, 3) of a surface with each board of `where` (h, w) put together of columns of witnesses."""
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(where.astype(np.uint8), connectivity=8)
+    image = image.copy()
+    for label, (x, y, width, height, _) in enumerate(stats[1:n], start=1):
+        top = max(y - MARGIN_PX, 0)
+        box = np.s_[top : y + height + MARGIN_PX, x : x + width]
+        board = np.asarray(labels[box] == label)
+        views, seen, _ = _sampled(witnesses, surface, x, top, board.shape, MOST_VIEWS)
+        if not len(views):
+            continue
+        colours, usable = np.ascontiguousarray(views[..., :3]), seen > 0
+        chosen = cut_columns(colours, usable, board, column_costs(colours, usable, image[box], board))
+        columns = np.arange(width)
+        shown = usable[chosen, :, columns].T & board
+        image[box][shown] = colours[chosen, :, columns].swapaxes(0, 1)[shown]
+    return image
+
+
+def _sampled(
+    witnesses: Sequence[Witness],
+    surface: Surface,
+    x: int,
+    y: int,
+    shape: tuple[int, int],
+    most: int | None = None,
+) -> tuple[Picture, Picture, NDArray[np.int64]]:
+    """The witnesses that meet a tile (h, w) at x, y, on its pixels: pictures (n, h, w, 4), where they are usable
+    (n, h, w), 0 = not, and their frames (n,). most: of more some are left out, evenly."""
+    here = [w for w in witnesses if _meet(w.box, x, y, shape)]
+    if most is not None and len(here) > most:
+        here = [here[row] for row in np.linspace(0, len(here) - 1, most).round().astype(int)]
+    views = np.zeros((len(here), *shape, 4), np.uint8)
+    seen = np.zeros((len(here), *shape), np.uint8)
+    rays = _rays(surface, x, y, shape)
+    for view, usable, witness in zip(views, seen, here, strict=True):
+        _sample(witness, rays, view, usable)
+    return views, seen, np.array([w.placement.frame for w in here], np.int64)
+
+
+def _meet(box: tuple[float, float, float, float], x: int, y: int, shape: tuple[int, int]) -> bool:
+    return box[0] < x + shape[1] and box[2] > x and box[1] < y + shape[0] and box[3] > y
 
 
 def _rays(surface: Surface, x: int, y: int, shape: tuple[int, int]) -> NDArray[np.float64]:

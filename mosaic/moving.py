@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mosaic.appearance import Appearance, classes_of, count_classes, learn
+from mosaic.boards import other_text
 from mosaic.canvas import Canvas
 from mosaic.ground import Witness, apart, decide, evidence
 from mosaic.motion import expand_map, local_contrast
@@ -66,11 +67,12 @@ class _Small:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Ground:
     """On the small surface: image (h, w, 3); sure (h, w) uint8, 1 where it is taken for the ground; contested (h, w)
-    uint8, 1 where the views disagree."""
+    uint8, 1 where the views disagree; boards (h, w) uint8, 1 where they change their text."""
 
     image: NDArray[np.uint8]
     sure: NDArray[np.uint8]
     contested: NDArray[np.uint8]
+    boards: NDArray[np.uint8]
 
 
 def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.uint8]]:
@@ -89,19 +91,19 @@ def find_still(scene: Scene) -> tuple[tuple[NDArray[np.uint8], ...], NDArray[np.
     quiet = _quiet(layers, scene.options, shrink)
     contested = quiet == 0
     sure = (layers.support > CERTAIN) & (layers.spread <= 2 * scene.options.doubt)
-    ground = _Ground(layers.image, sure.astype(np.uint8), contested.astype(np.uint8))
+    ground = _Ground(layers.image, sure.astype(np.uint8), contested.astype(np.uint8), np.zeros_like(quiet))
     with ThreadPoolExecutor(scene.options.threads) as pool:
         views = list(pool.map(partial(_small_view, small, shrink=shrink), range(len(scene.views))))
         for _ in range(scene.options.motion_rounds):
             moving = np.sum(list(pool.map(partial(_bodies, ground=ground), views)), axis=0)
             look = learn(ground.image, layers.n_seen > 0, ground.sure > 0, moving)
             witnesses = list(pool.map(partial(_witness, look=look), views))
-            image, moments = decide(
+            image, moments, boards = decide(
                 witnesses, layers.image, contested, small.surface, scene.options.threads,
                 together=scene.options.together,
             )  # fmt: skip
             known = np.where(contested, moments > 1, sure)
-            ground = replace(ground, image=image, sure=known.astype(np.uint8))
+            ground = replace(ground, image=image, sure=known.astype(np.uint8), boards=boards.astype(np.uint8))
         before = scene.still or (None,) * len(views)
         planes = list(pool.map(partial(_still_plane, ground=ground, look=look), views, before))
     return tuple(planes), quiet
@@ -224,14 +226,15 @@ def _still_plane(
     smeared = np.clip(behind, cv2.erode(view.picture, square), cv2.dilate(view.picture, square))
     spared = contested & (apart(smeared, behind) < SAME_GREY) & (look.ratio(view.picture, at) > 0)
     differs &= ~spared
+    other = other_text(differs, cv2.remap(ground.boards, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0)
     core = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    shows = contested & (off < SAME_GREY) & (view.known > 0)
+    shows = contested & (off < SAME_GREY) & (view.known > 0) & ~other
     side = 2 * max(2, round(width / 40)) + 1  # bridges a gap of a twentieth of the width
     body = cv2.dilate(cv2.morphologyEx(core, cv2.MORPH_CLOSE, _disc(side), borderValue=0), _disc(5))
     # Who was seen moving stands as close by.
     plane = _near_bodies(np.maximum(body, (view.known <= DISTRUSTED).astype(np.uint8)))
     plane[body > 0] = HALO
-    plane[core > 0] = DISTRUSTED
+    plane[(core > 0) | other] = DISTRUSTED
     known = view.known if before is None or before.size == 1 else before  # finer planes keep their outlines
     size = (known.shape[1], known.shape[0])
     plane = np.minimum(cv2.resize(plane, size, interpolation=cv2.INTER_NEAREST), known)

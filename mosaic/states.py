@@ -25,6 +25,8 @@ EVIDENCE_STEP = 1 / 20  # nats per grey level of the evidence plane, 128 = none
 APART = ((0, 1), (1, 0), (0, 5), (5, 0), (0, 12), (12, 0))
 UNSEEN = (1.0, 1.0, 1.0, 1.0, 0.5, 0.5)
 REACH = max(max(pair) for pair in APART)
+# Restless is where no colour was seen at this share of the moments at which a place was seen, of so many at least.
+RESTLESS_SHARE, RESTLESS_MOMENTS = 0.6, 4
 SWEEPS = 3  # of belief propagation, each to and fro
 NEVER = np.float32(-1e6)  # value of a state that a pixel does not have
 
@@ -36,6 +38,7 @@ class States:
     """Of each pixel the likeliest states. colour (h, w, N_STATES, 3); value (h, w, N_STATES): log of how likely one is
     by itself, up to a constant, NEVER where there are fewer; moments (h, w, N_STATES): at which it was seen. together
     (h, w, len(APART)) uint16: bit s * N_STATES + t is 1 if a frame shows state s here and t at the pixel APART.
+    restless (h, w) bool: where no state comes again often.
 
     A pixel that is not contested has one state, the composite's."""
 
@@ -43,11 +46,14 @@ class States:
     value: NDArray[np.float32]
     moments: NDArray[np.uint8]
     together: NDArray[np.uint16]
+    restless: NDArray[np.bool_]
 
     def part(self, x: int, y: int, side: int) -> States:
         """The same arrays, from x, y on, side x side or to their end."""
         box = np.s_[y : y + side, x : x + side]
-        return States(self.colour[box], self.value[box], self.moments[box], self.together[box])
+        return States(
+            self.colour[box], self.value[box], self.moments[box], self.together[box], self.restless[box]
+        )
 
     def picture(
         self, chosen: Picture, composite: Picture, contested: NDArray[np.bool_]
@@ -68,6 +74,7 @@ def no_states(height: int, width: int) -> States:
         value=np.zeros((height, width, N_STATES), np.float32),
         moments=np.zeros((height, width, N_STATES), np.uint8),
         together=np.zeros((height, width, len(APART)), np.uint16),
+        restless=np.zeros((height, width), np.bool_),
     )
 
 
@@ -88,15 +95,17 @@ def find_states(
     value = np.full((height, width, N_STATES), NEVER, np.float32)
     moments = np.zeros((height, width, N_STATES), np.uint8)
     shows = np.full((n, height, width), -1, np.int8)
-    _find(views, seen, frames, composite, contested, colour, value, moments, shows)
+    restless = np.zeros((height, width), np.bool_)
+    _find(views, seen, frames, composite, contested, colour, value, moments, shows, restless)
     h, w = states.moments.shape[:2]
+    states.restless[:] = restless[:h, :w]
     states.colour[:], states.value[:], states.moments[:] = colour[:h, :w], value[:h, :w], moments[:h, :w]
     for edge, (down, right) in enumerate(APART):
         _together(shows, down, right, states.together[..., edge])
 
 
 @numba.njit(cache=True, nogil=True)
-def _find(views, seen, frames, composite, contested, colour, value, moments, shows):  # type: ignore[no-untyped-def]
+def _find(views, seen, frames, composite, contested, colour, value, moments, shows, restless):  # type: ignore[no-untyped-def]
     """Each view's colour is a candidate, and the composite's: log of the moments at which views have it, plus the mean
     of what these views' evidence says. shows (n, h, w): which of the states a view shows, -1: none."""
     n, height, width = seen.shape
@@ -143,6 +152,13 @@ def _find(views, seen, frames, composite, contested, colour, value, moments, sho
                 n_at[a] = n_moments
                 if n_same > 0:
                     worth[a] = np.log(np.float32(n_moments)) + np.float32(EVIDENCE_STEP) * says / n_same
+            last, n_all, n_top = -MOMENT_FRAMES, 0, 0
+            for b in range(m):
+                n_top = max(n_top, n_at[b])
+                if when[b] - last >= MOMENT_FRAMES:
+                    last = when[b]
+                    n_all += 1
+            restless[i, j] = n_all >= RESTLESS_MOMENTS and n_top < RESTLESS_SHARE * n_all
             for s in range(N_STATES):
                 best = 0
                 for a in range(1, m + 1):

@@ -26,7 +26,7 @@ def witness(frame, colour, nats=0.0, usable=True):
 def decided(witnesses, composite_colour=SHIRT, contested=True):
     composite = np.full((64, 96, 3), composite_colour, np.uint8)
     where = np.full((64, 96), contested)
-    return decide(witnesses, composite, where, SURFACE, 1)
+    return decide(witnesses, composite, where, SURFACE, 1)[:2]
 
 
 def test_a_body_in_most_frames_is_outvoted_by_how_it_looks():

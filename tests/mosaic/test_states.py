@@ -1,6 +1,7 @@
 """States of contested pixels: what was seen together stays together."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_a_row_is_solved_exactly(monkeypatch):
         found = no_states(1, width)
         found.value[:] = rng.normal(0, 1, found.value.shape)
         together = rng.integers(0, 1 << 16, (1, width, 1)).astype(np.uint16)
-        found = states_module.States(found.colour, found.value, found.moments, together)
+        found = replace(found, together=together)
         chosen = settle(found, np.ones((1, width), bool))[0]
 
         def worth(way, values=found.value[0], bits=together[0, :, 0]):
