@@ -330,7 +330,7 @@ def _judge(
         # The pixels know the homography better than the grid does, whose cells all have a floor that is not noise
         # (measured at 1080p with 11 % players: corners .009 px against .09 px).
         H = homography(state)
-        info = pixel_information(pair, state, fine, anchors)
+        info = pixel_information(pair, state, fine, anchors, options.noise_ratio)
     else:
         start = _warp_homography(level.src_px, fine.dst)
         H, info9 = fit_homography_to_flow(flow.src_px, flow.dst_px, flow.info, start)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ class RegisterOptions:
     cell_floor_px: error of a cell's place that is not noise (crowd, codec;
     real-footage.md 6.3). cell_max_px: directions less certain are dropped. cell_linear_px: residual flow beyond which
     it is no measurement, found in flow_passes local steps. correlation: variance inflation of a cell, whose residuals
-    are correlated between pixels. kernel: see kernels.py.
+    are correlated between pixels. noise_ratio: how much more noise the 3x3 blur leaves than the pictures have,
+    where they were smoothed more: what no residual shows is stated by the noise (verdict.py). kernel: see kernels.py.
     """
 
     max_steps: tuple[int, ...] = (4, 5, 6, 8, 10, 10)
@@ -47,7 +48,13 @@ class RegisterOptions:
     cell_linear_px: float = 4.0
     flow_passes: int = 4
     correlation: float = 4.0
+    noise_ratio: float = 1.0
     kernel: kernels.KernelName = "numba"
+
+
+def rough(options: RegisterOptions) -> RegisterOptions:
+    """The same for a fit whose last tenth of a standard deviation and whose flow grid nobody looks at."""
+    return replace(options, stop_sigmas=max(options.stop_sigmas, 0.3), flow_passes=1)
 
 
 @dataclass(slots=True, eq=False)

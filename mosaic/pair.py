@@ -21,8 +21,10 @@ from mosaic.blur import equally_sharp
 from mosaic.coded import blockiness
 from mosaic.coords import level_matrix, level_scale, normalise_homography, transfer
 from mosaic.estimator import RegisterOptions, align
+from mosaic.finish import finished
 from mosaic.gray import as_gray, as_mask, as_planes, white_of
 from mosaic.kernels import KernelName
+from mosaic.level import rough
 from mosaic.minority import AGREE_GREY, CLEARLY_MORE, HELD, agreement, best_minority, of_matches
 from mosaic.pyramid import Pyramid, build_pyramid, n_levels_for
 from mosaic.records import PAIR_REASONS, FloatArray, PairFit, PairStatus
@@ -74,6 +76,7 @@ class PairOptions:
     turning: hold what the pixels leave open by what a camera does that turns and zooms about the middle of its picture
     (turning.py): a pull, not a wall; where it cannot be what a camera does and a part of the picture disagrees too,
     look for another motion (bent.py), else say `bent`. Off to leave all eight parameters to the pixels.
+    finish: end with steps on pictures that are smoothed more, and alike in the scene (finish.py).
     cell_px, max_away: a pair is weak where more than that share of the cells was found farther than cell_px from where
     the homography puts them; max_std_px: or where the anchors' stated error is larger. sure_score, sure_away,
     sure_std_px: when no other start is tried; else the best of all starts is taken, by status and score (measured on
@@ -94,6 +97,7 @@ class PairOptions:
     symmetric_px: float | None = 1.0
     match_blur: bool = True
     turning: bool = True
+    finish: bool = True
     cell_px: float = 0.5
     max_away: float = 0.3
     max_std_px: float = 0.4
@@ -163,7 +167,10 @@ def register_pyramids(
         best = _unbent(source, target, prepared, best, levels, options)
     # What no pixels hold they would spoil once more (two of 45 pairs with 40 % players: .2 and .3 px became 20 and 19).
     if options.match_blur and best.route != "matches":
-        best = _equally_sharp(source, target, best, levels, options)
+        best, source, target = _equally_sharp(source, target, best, levels, options)
+    # Doubted ones may drift: their pixels' robust scale is that of what moves. Noise alone makes a score high.
+    if options.finish and best.usable and (best.status == PairStatus.OK or best.reason == "score"):
+        best = finished(best, source, target, options.selection, options.estimator)
     return _held(best, source, target, options) if options.turning else best
 
 
@@ -203,20 +210,20 @@ def _unbent(
 
 def _equally_sharp(
     source: Pyramid, target: Pyramid, best: PairFit, levels: list[int], options: PairOptions
-) -> PairFit:
-    """The fit, or the better one of the pictures made equally sharp."""
+) -> tuple[PairFit, Pyramid, Pyramid]:
+    """The fit, or the better one of the pictures made equally sharp; with the pictures that it is of."""
     if not best.usable:
-        return best
+        return best, source, target
     equal = equally_sharp(source, target, best.H_dst_src, best.gain, best.offset)
     if equal is None:
-        return best
+        return best, source, target
     again, _ = align(
         prepare(build_template(equal[0], 0, options=options.selection), HomographyFamily(size_px=target.size_px)),
         equal[1], best.H_dst_src, dst=1, levels=[i for i in (1, 0) if i in levels], options=options.estimator,
         route=best.route + ", blur matched",
     )  # fmt: skip
     again = replace(_judged(again, options), n_steps=best.n_steps + again.n_steps)
-    return again if _order(again) < _order(best) else best
+    return (again, *equal) if _order(again) < _order(best) else (best, source, target)
 
 
 def _held(fit: PairFit, source: Pyramid, target: Pyramid, options: PairOptions) -> PairFit:
@@ -384,7 +391,7 @@ def _both_ways(
         return fit, 0
     back, _ = align(
         reverse, source, normalise_homography(np.linalg.inv(fit.H_dst_src)), dst=0, levels=levels,
-        options=options.estimator,
+        options=rough(options.estimator),
     )  # fmt: skip
     if back.reason in _NO_VERDICT:
         return fit, back.n_steps

@@ -69,7 +69,9 @@ def _tukey_agreement(residual: NDArray[np.float32], sigma: float) -> FloatArray:
     return np.asarray((1.0 - u * u) ** 3)
 
 
-def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: FloatArray) -> FloatArray:
+def pixel_information(
+    pair: LevelPair, state: Any, fine: Linearised, anchors: FloatArray, noise_ratio: float = 1.0
+) -> FloatArray:
     """Information (2k, 2k) px^-2 of where k = 4 anchors land, from the pixels' normal equations at `fine`.
 
     Residuals are no independent draws: the blur, the codec and whoever walks through the picture tie neighbours
@@ -104,13 +106,14 @@ def pixel_information(pair: LevelPair, state: Any, fine: Linearised, anchors: Fl
         return unknown
     # What no residual shows: every cell as a whole may be off by some hundredths of a pixel.
     moments = kernel.cell_moments(fine.G, fine.J, weight, level.cell, N_CELLS)
-    common = (CELL_PX_PER_GREY * fine.sigma) ** 2 * np.einsum("cak,cbk->ab", moments, moments)
+    unseen_grey = noise_ratio * fine.sigma
+    common = (CELL_PX_PER_GREY * unseen_grey) ** 2 * np.einsum("cak,cbk->ab", moments, moments)
     kappa, kappa_small = _kappa(scores, N), _kappa(small, N)
     growth = max(1.0, kappa / kappa_small) if kappa_small > 0 else 1.0
     variance = max(kappa, fine.sigma**2)
     inverse = np.linalg.inv(N)
     covariance = growth**2 * (J8 @ (variance * inverse + inverse @ common @ inverse) @ J8.T)
-    away_px = displacement_px(pair.source.template.blocks, pair.target.blocks, fine.sigma)
+    away_px = displacement_px(pair.source.template.blocks, pair.target.blocks, unseen_grey)
     if away_px > 0:
         covariance += away_px**2 * (J8 @ inverse @ _displaced(pair, fine, weight) @ inverse @ J8.T)
     # Anchors at the horizon of a wrong homography move by anything.
