@@ -102,7 +102,8 @@ def true_picture(clip: SynthClip, run: Path) -> Truth:
         passed |= player
         n_clear += inside & ~player & ~other
     mean = _expanded(rays / np.maximum(weight, 1e-9)[..., None], shape)
-    reference = int(read_run(run).shots[0].reference_frame)
+    wanted = int(read_run(run).shots[0].reference_frame)
+    reference = min(placed, key=lambda k: abs(k - wanted))  # its own camera may be one that the run withdrew
     turn = clip.camera(reference).R_cam_world.T @ placed[reference].pose.R
     plain = (
         surface.pixel_to_ray(np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1))
