@@ -162,9 +162,8 @@ def shifted(family: WarpFamily, state: Any, prepared: Any, shift_px: FloatArray)
 
 def _median_step(steps_px: FloatArray) -> FloatArray:
     """The median (2,) of steps (n, 2) px, of which some are NaN; NaN where all are."""
-    known = steps_px[
-        np.isfinite(steps_px).all(axis=1)
-    ]  # of so few np.nanmedian makes a masked array, 30 times as long
+    # Of so few np.nanmedian makes a masked array, which takes longer than the warp.
+    known = steps_px[np.isfinite(steps_px).all(axis=1)]
     return np.asarray(np.median(known, axis=0)) if len(known) else np.full(2, np.nan)
 
 
