@@ -36,6 +36,7 @@ FloatArray = NDArray[np.float64]
 RESTING_PX, MOVING_PX = 0.5, 1.0
 # A prediction that missed the last frame by less than a px of this level is looked for on it and finer ones only.
 NEAR_LEVEL, NEAR_PX = 2, 4.0
+RESCUED = ("phase correlation", "features")  # routes of a pair that no prediction found
 # Beyond a cut another camera may show the same venue, and features find its stands there. 53 pairs that features or
 # phase correlation found a quarter to half a picture away: right ones score .12 to .39, whether neighbours or 58 frames
 # apart; wrong ones, across cuts and in smeared pictures, .39 and .58 to .79. That at .39 zoomed by 1.8.

@@ -14,14 +14,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mosaic.records import PairStatus
+from mosaic.records import PairFit, PairStatus
 from pipelines.edits import LAG, EditFinder, EditFound
 from pipelines.preparation import PreparedFrame
+from pipelines.routes import RESCUED
 from pipelines.tracking import ShotTracker
 
 # Frames after a break at which the costly rescue is tried; plain prediction is tried on every frame.
 RESCUE_AFTER = (0, 1, 2, 4, 7, 10)
-RESCUED = ("phase correlation", "features")  # routes of a pair that no prediction found
+LEAPS = (*RESCUED, "composed")  # such a pair may lead from one view to another of the same venue
+# Share of an edit that a pair crosses and its score, from which there is none. Within a view such pairs score .17 to
+# .31, across most of a wipe, a stinger or a dissolve .34 to .53.
+MOST, MOST_SCORE = 2 / 3, 0.32
 JUMP = 4.0  # times the motion before: such a rescued pair is a cut to another picture of the same camera
 WAIT = 24  # frames after a break for the end of a fade or a graphic to show
 KEPT = LAG + 6  # frames from which a new shot can begin again; 3.5 MB each at 1080p
@@ -195,14 +199,19 @@ def _motion_of(tracker: ShotTracker, frame: int) -> NDArray[np.float64] | None:
 
 
 def _spanned(tracker: ShotTracker, found: EditFound) -> bool:
-    """Whether one verified pair joins a picture before the edit to one after it: then both show the same view.
+    """Whether one verified pair joins a picture before the edit to one after it, or crosses most of it: then both show
+    the same view.
 
-    Players who fill the picture look like an edit to small pictures; the ground between them still registers."""
+    Players who fill the picture and hoardings that change look like an edit to small pictures; what lies between them
+    still registers."""
+
+    def crossed(fit: PairFit) -> float:
+        return (min(fit.dst, found.first) - max(fit.src, found.last)) / (found.first - found.last)
+
     return any(
         fit.status == PairStatus.OK
-        and fit.route != "composed"
-        and fit.src <= found.last
-        and fit.dst >= found.first
+        and fit.route not in LEAPS
+        and crossed(fit) >= (MOST if fit.score <= MOST_SCORE else 1.0)
         for fit in tracker.fits
     )
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from pipelines.edits import edit_picture
-from pipelines.shots import ShotSplitter, TrackedShot
+import pytest
+
+from mosaic.records import PairStatus
+from pipelines.edits import EditFound, edit_picture
+from pipelines.shots import ShotSplitter, TrackedShot, _spanned
 from tests.mosaic.textures import as_uint8, picture
 
 
@@ -46,3 +49,22 @@ def test_a_long_shot_is_divided_and_every_frame_is_in_one_part():
 
 def test_without_a_limit_it_is_one_shot():
     assert [(len(frames), end) for frames, end in _frames_of_shots(70, None)] == [(70, "end")]
+
+
+@pytest.mark.parametrize(
+    ("src", "dst", "status", "route", "score", "spanned"),
+    [
+        (30, 61, PairStatus.OK, "predicted", 0.45, True),  # from before it to after it
+        (38, 58, PairStatus.OK, "link", 0.25, False),  # not two thirds of it
+        (38, 68, PairStatus.OK, "link", 0.25, True),
+        (38, 68, PairStatus.OK, "link", 0.40, False),  # mixed pictures may agree so far
+        (30, 61, PairStatus.WEAK, "predicted", 0.25, False),
+        (30, 61, PairStatus.OK, "features", 0.25, False),  # finds the same stands from another camera
+        (30, 61, PairStatus.OK, "composed", 0.25, False),
+    ],
+)
+def test_an_edit_that_a_sure_pair_crosses_is_none(src, dst, status, route, score, spanned):
+    """Of a gradual edit from frame 30 to 61."""
+    pair = SimpleNamespace(src=src, dst=dst, status=status, route=route, score=score)
+    found = EditFound(last=30, first=61, kind="transition")
+    assert _spanned(SimpleNamespace(fits=[pair]), found) is spanned  # type: ignore[arg-type]
