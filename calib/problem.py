@@ -276,8 +276,11 @@ def linearise(packed: Packed, state: State, loss: Loss, *, pose_only: bool = Fal
             s11, s12, s22 = packed.s11[part], packed.s12[part], packed.s22[part]
             ex, ey = s11 * rx + s12 * ry, s12 * rx + s22 * ry
             e2 = ex * ex + ey * ey
-            e2[:, packed.dof[part] <= 0] = 0.0
+            unknown = packed.dof[part] <= 0
+            e2[:, unknown] = 0.0
             value, weight = loss.value_and_weight(e2)
+            # What counts nothing must not pull: a gradient of points without a cost leaves no state at rest.
+            weight[:, unknown] = 0.0
             cost += value.sum((1, 2))
             root = np.sqrt(weight)
             e = np.stack([ex * root, ey * root], -2).reshape(S, -1, 2 * m, 1)

@@ -331,3 +331,20 @@ def test_a_long_pan_is_solved_in_few_steps():
     assert best.converged and again.converged
     assert abs(again.cost / best.cost - 1) < 1e-5
     assert again.n_steps < 30  # 12; with straight steps 56
+
+
+def test_points_too_weak_to_count_do_not_pull_either():
+    """Points known worse than 1 px are no measurements: wherever they lie, the optimum is the one without them."""
+    _, graph = make(3, n=10, pan_deg=25.0, f_w=1.5, zoom=1.5)
+    rng = np.random.default_rng(0)
+    edges, without = [], []
+    for edge in graph.edges:
+        weak = rng.uniform(size=len(edge.grid_a)) < 0.3
+        info = np.where(weak[:, None, None], 0.6 * np.eye(2), edge.info)
+        moved = edge.grid_b + np.where(weak[:, None], [3.0, -2.0], 0.0)
+        edges.append(replace(edge, info=info, grid_b=moved))
+        without.append(replace(edge, info=np.where(weak[:, None, None], 0.0, edge.info)))
+    solution = refine(replace(graph, edges=tuple(edges)))
+    reference = refine(replace(graph, edges=tuple(without)))
+    assert solution.converged
+    np.testing.assert_allclose(solution.log_f, reference.log_f, atol=1e-6)
